@@ -1,0 +1,53 @@
+"""What every codec is: bytes in, frames and malformed bytes out, and back; no I/O and no clock of its own."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from psiu_broker.frame import Frame, Malformed
+
+Event = Frame | Malformed
+
+
+@dataclass(slots=True)
+class Directory:
+    """The robots that the broker knows of now. Codecs only read it; it changes under them.
+
+    `names` settles where a name with spaces begins; `numbers` (of one domain) tells a found
+    PSIU HEXA packet from noise whose CRC fits by luck.
+    """
+
+    names: set[str] = field(default_factory=set)
+    numbers: set[int] = field(default_factory=set)
+
+
+class Codec(ABC):
+    """One stream's worth of one protocol. `now` is in seconds on any steady clock."""
+
+    protocol: ClassVar[str]
+    dialect: str
+    """The exact form on the wire; a frame heard in the same dialect is forwarded as it came."""
+    silence_s: float
+    """A silence this long ends whatever was begun: the link then calls `flush`."""
+
+    @abstractmethod
+    def decode(self, data: bytes, now: float) -> Sequence[Event]:
+        """Take the next bytes of the stream; return what they complete, in order. Never raises."""
+
+    @abstractmethod
+    def flush(self, now: float) -> Sequence[Event]:
+        """A boundary (silence, end of a datagram): give up or accept what is begun. Never raises."""
+
+    @property
+    @abstractmethod
+    def pending(self) -> bool:
+        """True while bytes wait for more."""
+
+    @abstractmethod
+    def encode(self, frame: Frame) -> bytes:
+        """The bytes of `frame` in this dialect; `frame.wire` itself where it came in the same one.
+
+        Raises:
+            EncodeError: this protocol or dialect cannot say it.
+        """

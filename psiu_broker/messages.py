@@ -1,0 +1,203 @@
+"""The messages that programs see on the bus, as pydantic models; `psiu schema` prints their JSON schema.
+
+Fields are added, never renamed. Times are UTC, RFC 3339 with microseconds.
+"""
+
+from datetime import datetime
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
+
+from psiu_broker.errors import CallCode
+
+
+def _rfc3339(moment: datetime) -> str:
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+Moment = Annotated[datetime, PlainSerializer(_rfc3339, return_type=str, when_used="json")]
+Value = int | float | str
+
+
+class Message(BaseModel):
+    """What all messages share: unknown fields of a newer broker are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class Decoded(Message):
+    """A frame that a robot sent, in words: ``psiu/{source}/{destination}/{subject}``."""
+
+    source: str
+    destination: str
+    protocol: str
+    kind: Literal["command", "response", "ping", "ack", "nak", "busy", "available", "free", "wtf", "node", "complex"]
+    command: str | None = Field(None, description="the command word or the node's name")
+    parameters: list[Value] = []
+    status: Literal["sucesso", "falha"] | None = None
+    node: int | None = Field(None, description="PSIU HEXA: node number, 0 in a sensor's answer")
+    signal: int | None = Field(None, description="PSIU HEXA: the node's signal byte, 0–255")
+    value: float | None = Field(None, description="the signal in the unit of the node's declared type")
+    unit: str | None = None
+    fields: list[str] | None = Field(None, description="PSIU HEXA complex: the fields in hexadecimal")
+    remark: str | None = Field(None, description="what a tolerant codec forgave, such as a wrong size")
+    broker: str
+    link: str
+    received: Moment
+    wire: str = Field(description="the bytes on the wire, in hexadecimal")
+
+
+class Command(Message):
+    """One command of a robot, as `exibecomando` tells it: a name and how many parameters of each type."""
+
+    name: str
+    ints: int = 0
+    floats: int = 0
+    chars: int = 0
+    minimum: int | None = None
+    maximum: int | None = None
+    unit: str | None = None
+
+
+class Card(Message):
+    """A robot that the broker knows: ``psiu/{robot}``."""
+
+    robot: str
+    address: str | None = Field(None, description="its PSIU HEXA address, where it has one")
+    protocol: str
+    broker: str
+    link: str
+    peer: str | None = None
+    link_state: str
+    first_heard: Moment | None = None
+    last_heard: Moment | None = Field(None, description="null: configured but never heard")
+    commands: list[Command] = []
+    frames_heard: int = 0
+
+
+class CallRequest(Message):
+    """The payload of ``psiu/@call/{robot}/{command}``; none at all means no parameters."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    parameters: list[Value] = Field([], max_length=64)
+    timeout_s: float | None = Field(None, gt=0, le=3600)
+
+
+class Answer(Message):
+    """What a robot answered to a call."""
+
+    status: Literal["sucesso", "falha"] | None = None
+    values: list[Value] = []
+    unit: str | None = None
+    elapsed_ms: float
+
+
+class Refusal(Message):
+    """Why a call has no answer from its robot: the payload of a Zenoh error reply."""
+
+    error: CallCode
+    message: str
+
+
+class RawFrame(Message):
+    """One frame of a link with what became of it: ``psiu/@raw/{broker}/{link}``."""
+
+    direction: Literal["in", "out"]
+    broker: str
+    link: str
+    peer: str | None = None
+    source: str | None = None
+    destination: str | None = None
+    subject: str | None = None
+    verdict: str
+    detail: str | None = None
+    received: Moment
+    wire: str
+
+
+class Link(Message):
+    """One link: ``psiu/@broker/{broker}/links``."""
+
+    name: str
+    adapter: str
+    protocol: str
+    state: Literal["waiting", "opening", "open", "closed"]
+    reason: str | None = Field(None, description="what it waits for, in words")
+    since: Moment
+    peers: list[str] = []
+    robots: int = 0
+    frames_in: int = 0
+    frames_out: int = 0
+    malformed: int = 0
+    queued: int = 0
+    reopened: int = 0
+    last_heard: Moment | None = None
+    details: dict[str, Value] = {}
+
+
+class Route(Message):
+    """Where frames for a robot go: ``psiu/@broker/{broker}/routes``."""
+
+    robot: str
+    link: str
+    peer: str | None = None
+    origin: Literal["learned", "static"]
+    age_s: float | None = Field(None, description="since its last checked frame; null for a static route never heard")
+    expires_in_s: float | None = None
+
+
+class Account(Message):
+    """What became of the frames that arrived on one link (or of the broker's own, link ``@self``)."""
+
+    link: str
+    arrived: int
+    delivered: int
+    answered: int
+    dropped: dict[str, int] = Field({}, description="frames by reason")
+    waiting: int = Field(0, description="in an outbox or held for a route at this moment")
+
+
+class Ledger(Message):
+    """The fate of every frame: ``psiu/@broker/{broker}/ledger``. arrived = delivered + answered + dropped + waiting."""
+
+    accounts: list[Account]
+    total: Account
+    balances: bool
+
+
+class Status(Message):
+    """The broker itself: ``psiu/@broker/{broker}/status``."""
+
+    broker: str
+    version: str
+    started: Moment
+    uptime_s: float
+    links_open: int
+    links: int
+    robots: int
+    zenoh_id: str
+    listen: list[str]
+
+
+class Health(Message):
+    """What the watchdog looks at: ``psiu/@broker/{broker}/health``."""
+
+    healthy: bool
+    checks: dict[str, bool]
+
+
+class Why(Message):
+    """What the router would do with a frame from `a` to `b` now: ``psiu/@broker/{broker}/why/{a}/{b}``."""
+
+    a: str
+    b: str
+    delivered: bool
+    verdict: str
+    steps: list[str] = Field(description="the decision, one sentence a step")
+
+
+PUBLISHED: Final[tuple[type[Message], ...]] = (
+    Decoded, Card, CallRequest, Answer, Refusal, RawFrame, Link, Route, Ledger, Status, Health, Why,
+)
+"""The messages of the bus, in the order in which `psiu schema` prints them."""
