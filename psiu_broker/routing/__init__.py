@@ -1,0 +1,1 @@
+"""Where frames go, pure and told the time: routes, doubles, queues and the books."""

@@ -1,0 +1,35 @@
+"""A short memory of frames, against doubles.
+
+Where two radios hear one robot, or brokers stand in a ring, one frame arrives by several ways.
+The first way that brought it leads; the same frame by another way within the window is a double.
+By the leading way it is a repeat (a person who presses twice) and passes.
+"""
+
+from collections.abc import Hashable
+
+from psiu_broker.frame import Way
+
+
+class Duplicates:
+    """Remembers each frame for at least `window_s`, in two generations so that forgetting costs nothing."""
+
+    __slots__ = ("_capacity", "_new", "_old", "_since", "_window_s")
+
+    def __init__(self, window_s: float = 1.0, *, capacity: int = 65_536) -> None:
+        self._window_s = window_s
+        self._capacity = capacity
+        self._new: dict[Hashable, tuple[Way, float]] = {}
+        self._old: dict[Hashable, tuple[Way, float]] = {}
+        self._since = float("-inf")
+
+    def is_double(self, key: Hashable, way: Way, now: float) -> bool:
+        """Note the frame `key` heard on `way`; True if it came by another way less than the window ago."""
+        if now - self._since > self._window_s or len(self._new) >= self._capacity:
+            self._old = self._new
+            self._new = {}
+            self._since = now
+        seen = self._new.get(key) or self._old.get(key)
+        if seen is not None and seen[0] != way and now - seen[1] <= self._window_s:
+            return True
+        self._new[key] = (way, now)
+        return False

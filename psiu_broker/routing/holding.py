@@ -1,0 +1,63 @@
+"""Frames for a robot that nobody has heard yet: kept for a moment while it is asked for by name."""
+
+from typing import NamedTuple
+
+from psiu_broker.frame import Address, Frame, Way
+
+
+class Held(NamedTuple):
+    frame: Frame
+    arrived: Way
+    expires: float
+
+
+class Holding:
+    """A small, bounded waiting room, by destination."""
+
+    def __init__(self, hold_s: float = 0.5, *, capacity: int = 256) -> None:
+        self._hold_s = hold_s
+        self._capacity = capacity
+        self._held: dict[Address, list[Held]] = {}
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def waiting_from(self, link: str) -> int:
+        """How many of the held frames arrived on `link`."""
+        return sum(held.arrived.link == link for frames in self._held.values() for held in frames)
+
+    def asked(self, destination: Address) -> bool:
+        """True while frames wait for `destination`: it has been asked for already."""
+        return destination in self._held
+
+    def add(self, frame: Frame, arrived: Way, now: float) -> bool:
+        """Keep `frame`; False when the room is full."""
+        if self._size >= self._capacity:
+            return False
+        self._held.setdefault(frame.destination, []).append(Held(frame, arrived, now + self._hold_s))
+        self._size += 1
+        return True
+
+    def release(self, destination: Address) -> list[Held]:
+        """Take out the frames for `destination`, oldest first: it has been heard."""
+        released = self._held.pop(destination, [])
+        self._size -= len(released)
+        return released
+
+    def expire(self, now: float) -> list[Held]:
+        """Take out the frames whose destination did not answer in time."""
+        expired: list[Held] = []
+        for destination in list(self._held):
+            frames = self._held[destination]
+            late = [held for held in frames if held.expires <= now]
+            if late:
+                expired += late
+                frames[:] = [held for held in frames if held.expires > now]
+            if not frames:
+                del self._held[destination]
+        self._size -= len(expired)
+        return expired
+
+    def clear(self) -> list[Held]:
+        return self.expire(float("inf"))

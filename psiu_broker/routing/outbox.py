@@ -1,0 +1,123 @@
+"""What waits for one link: bounded, urgent first, and never late."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from psiu_broker.frame import Frame, Way
+from psiu_broker.routing.verdicts import DELIVERED, Verdict
+
+STOP_LANE: Final = 0
+COMMAND_LANE: Final = 1
+QUESTION_LANE: Final = 2
+
+STOP_WORDS: Final = frozenset({"pare", "parar", "para", "stop"})
+"""Command words that overtake everything that waits."""
+
+QUESTION_WORDS: Final = frozenset({"qualseunome", "quantoscomandos", "exibecomando", "exibecomandos"})
+
+
+def lane(frame: Frame) -> int:
+    """The lane of `frame`: stops before commands and answers, these before questions about a robot."""
+    if frame.subject in STOP_WORDS:
+        return STOP_LANE
+    return QUESTION_LANE if frame.subject in QUESTION_WORDS else COMMAND_LANE
+
+
+class Fate:
+    """What became of one frame that goes several ways, or that has to wait.
+
+    It is settled once, when the last of its copies is: delivered if any copy was, else dropped for
+    the reason of the first copy that failed.
+    """
+
+    __slots__ = ("_copies", "_verdict", "arrived", "frame")
+
+    def __init__(self, frame: Frame, arrived: Way, copies: int = 1) -> None:
+        self.frame = frame
+        self.arrived = arrived
+        self._copies = copies
+        self._verdict: Verdict | None = None
+
+    def settle(self, verdict: Verdict) -> Verdict | None:
+        """One copy ended as `verdict`; the verdict of the whole frame once this was the last."""
+        if self._verdict is None or verdict == DELIVERED:
+            self._verdict = verdict
+        self._copies -= 1
+        return self._verdict if self._copies == 0 else None
+
+
+class Parcel(NamedTuple):
+    """One copy of a frame, encoded for its link, and until when it is worth sending."""
+
+    wire: bytes
+    peer: object
+    lane: int
+    expires: float
+    fate: Fate
+
+
+class Outbox:
+    """A bounded queue of parcels in three lanes. Every parcel that goes in comes out exactly once:
+    taken, evicted, expired or cleared."""
+
+    __slots__ = ("_capacity", "_lanes", "_size")
+
+    def __init__(self, capacity: int = 64) -> None:
+        self._capacity = capacity
+        self._lanes: tuple[deque[Parcel], ...] = (deque(), deque(), deque())
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, parcel: Parcel) -> Parcel | None:
+        """Queue `parcel`; if there was no room, the parcel that had to go: the oldest of the least urgent lane."""
+        evicted = None
+        if self._size >= self._capacity:
+            least = next(lane for lane in reversed(self._lanes) if lane)
+            if least[0].lane < parcel.lane:
+                return parcel
+            evicted = least.popleft()
+            self._size -= 1
+        self._lanes[parcel.lane].append(parcel)
+        self._size += 1
+        return evicted
+
+    def first(self) -> Parcel | None:
+        """The parcel to send next, still in the box."""
+        for lane in self._lanes:
+            if lane:
+                return lane[0]
+        return None
+
+    def remove_first(self) -> None:
+        """Take out what `first` showed."""
+        for lane in self._lanes:
+            if lane:
+                lane.popleft()
+                self._size -= 1
+                return
+
+    def expire(self, now: float) -> list[Parcel]:
+        """Take out what is too late to send."""
+        return self._take_out(lambda parcel: parcel.expires <= now)
+
+    def remove_peer(self, peer: object) -> list[Parcel]:
+        """Take out what waits for a peer that is gone."""
+        return self._take_out(lambda parcel: parcel.peer == peer)
+
+    def clear(self) -> list[Parcel]:
+        """Take out everything: the link went down, and nothing of it may move a robot later."""
+        return self._take_out(lambda _: True)
+
+    def _take_out(self, unwanted: Callable[[Parcel], bool]) -> list[Parcel]:
+        taken: list[Parcel] = []
+        for lane in self._lanes:
+            if any(map(unwanted, lane)):
+                kept = [parcel for parcel in lane if not unwanted(parcel)]
+                taken += [parcel for parcel in lane if unwanted(parcel)]
+                lane.clear()
+                lane.extend(kept)
+        self._size -= len(taken)
+        return taken

@@ -1,0 +1,133 @@
+"""Who was heard where, and when."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from psiu_broker.frame import Address, Way
+
+
+class Binding(NamedTuple):
+    """A robot of the configuration: its name, its number if it has one, and the way to it."""
+
+    name: Address
+    number: Address | None
+    way: Way
+    protocol: str
+
+    @property
+    def addresses(self) -> tuple[Address, ...]:
+        return (self.name,) if self.number is None else (self.name, self.number)
+
+
+class Route:
+    """The way to one robot. Mutable: the router touches it for each frame that the robot sends."""
+
+    __slots__ = ("addresses", "decision", "first_heard", "frames", "heard_at", "home", "pinned", "protocol", "way")
+
+    def __init__(self, addresses: tuple[Address, ...], way: Way, protocol: str, *, pinned: bool) -> None:
+        self.addresses = addresses
+        self.way = way
+        self.home = way
+        """Where the configuration says the robot is; its peer there may be learned."""
+        self.protocol = protocol
+        self.pinned = pinned
+        """True for a route of the configuration: it neither ages nor moves to another link."""
+        self.decision: object = None
+        """What the router answers for a frame in the robot's own protocol, while its link is up."""
+        self.first_heard: float | None = None
+        self.heard_at: float | None = None
+        self.frames = 0
+
+    @property
+    def robot(self) -> Address:
+        return self.addresses[0]
+
+
+class Departed(NamedTuple):
+    """Where a robot was last heard, once its route was withdrawn."""
+
+    link: str
+    at: float
+
+
+class Table:
+    """Routes by address, bounded; a robot with a name and a number has one route under both."""
+
+    def __init__(self, bindings: tuple[Binding, ...] = (), *, capacity: int = 4096) -> None:
+        self.routes: dict[Address, Route] = {}
+        self.refused = 0
+        """Robots that were not learned because the table was full."""
+        self._capacity = capacity
+        self._departed: dict[Address, Departed] = {}
+        for binding in bindings:
+            self._enter(Route(binding.addresses, binding.way, binding.protocol, pinned=True))
+
+    def __iter__(self) -> Iterator[Route]:
+        """Each route once."""
+        return (route for address, route in self.routes.items() if route.addresses[0] == address)
+
+    def learn(self, address: Address, way: Way, protocol: str, now: float) -> Route | None:
+        """Note that `address` was heard on `way`; None when the table is full or the route is pinned elsewhere.
+
+        The newest checked frame wins: a robot that moved is followed. A robot of the configuration
+        keeps its link, but its peer on that link is learned.
+        """
+        route = self.routes.get(address)
+        if route is None:
+            if len(self.routes) >= self._capacity:
+                self.refused += 1
+                return None
+            route = Route((address,), way, protocol, pinned=False)
+            self._enter(route)
+            self._departed.pop(address, None)
+        elif route.pinned and route.way.link != way.link:
+            return None
+        route.way = way
+        route.protocol = protocol
+        route.heard_at = now
+        route.frames += 1
+        if route.first_heard is None:
+            route.first_heard = now
+        return route
+
+    def forget_link(self, link: str, now: float) -> list[Route]:
+        """Withdraw what was learned on `link`; pinned routes stay, to say that their link is down."""
+        return self._forget([route for route in self if route.way.link == link], now)
+
+    def forget_way(self, way: Way, now: float) -> list[Route]:
+        """Withdraw what was learned by `way`."""
+        return self._forget([route for route in self if route.way == way], now)
+
+    def age(self, limit_s: dict[str, float], now: float) -> list[Route]:
+        """Withdraw the learned routes not heard for their link's `limit_s`."""
+        return self._withdraw(
+            [
+                route
+                for route in self
+                if not route.pinned and route.heard_at is not None and now - route.heard_at > limit_s[route.way.link]
+            ],
+            now,
+        )
+
+    def departed(self, address: Address) -> Departed | None:
+        return self._departed.get(address)
+
+    def _enter(self, route: Route) -> None:
+        for address in route.addresses:
+            self.routes[address] = route
+
+    def _forget(self, routes: list[Route], now: float) -> list[Route]:
+        for route in routes:
+            if route.pinned:
+                route.way = route.home
+        return self._withdraw([route for route in routes if not route.pinned], now)
+
+    def _withdraw(self, routes: list[Route], now: float) -> list[Route]:
+        for route in routes:
+            for address in route.addresses:
+                del self.routes[address]
+                self._departed.pop(address, None)
+                self._departed[address] = Departed(route.way.link, now)
+        while len(self._departed) > self._capacity:
+            del self._departed[next(iter(self._departed))]
+        return routes

@@ -1,0 +1,56 @@
+"""The closed set of fates of a frame, and the books that must balance."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+Verdict = Literal[
+    "delivered",
+    "answered",
+    "no_route",
+    "expired",
+    "queue_full",
+    "duplicate",
+    "same_way",
+    "refused",
+    "link_down",
+    "malformed",
+]
+
+DELIVERED: Final = "delivered"
+"""Handed whole to the transport of at least one link."""
+ANSWERED: Final = "answered"
+"""It was for the broker itself, or for a robot that the broker speaks for, and was dealt with here."""
+NO_ROUTE: Final = "no_route"
+"""Nobody knows the destination, and nobody answered when it was asked for."""
+EXPIRED: Final = "expired"
+"""It waited longer than its age limit."""
+QUEUE_FULL: Final = "queue_full"
+"""The outbox was full and this frame was the least urgent."""
+DUPLICATE: Final = "duplicate"
+"""The same frame came by another way a moment ago."""
+SAME_WAY: Final = "same_way"
+"""The destination is on the way it came from, and has heard it already."""
+REFUSED: Final = "refused"
+"""The link or the protocol cannot carry it, or its source cannot be who it says."""
+LINK_DOWN: Final = "link_down"
+"""The only link to the destination is down, or went down while the frame waited."""
+MALFORMED: Final = "malformed"
+"""Bytes that were no frame."""
+
+KEPT: Final[frozenset[Verdict]] = frozenset({DELIVERED, ANSWERED})
+"""The verdicts that are not a drop."""
+
+
+@dataclass(slots=True)
+class Account:
+    """The books of one link: how many frames arrived on it, and what became of how many."""
+
+    arrived: int = 0
+    fates: Counter[Verdict] = field(default_factory=Counter)
+
+    def dropped(self) -> dict[Verdict, int]:
+        return {verdict: count for verdict, count in self.fates.items() if verdict not in KEPT}
+
+    def settled(self) -> int:
+        return sum(self.fates.values())
