@@ -12,11 +12,16 @@ class Held(NamedTuple):
 
 
 class Holding:
-    """A small, bounded waiting room, by destination."""
+    """A small, bounded waiting room, by destination.
 
-    def __init__(self, hold_s: float = 0.5, *, capacity: int = 256) -> None:
+    Asking is bounded too, because anybody can send frames to names that nobody has: at most
+    `asks` destinations at once, so at most that many questions every `hold_s`.
+    """
+
+    def __init__(self, hold_s: float = 0.5, *, capacity: int = 256, asks: int = 8) -> None:
         self._hold_s = hold_s
         self._capacity = capacity
+        self._asks = asks
         self._held: dict[Address, list[Held]] = {}
         self._size = 0
 
@@ -32,8 +37,8 @@ class Holding:
         return destination in self._held
 
     def add(self, frame: Frame, arrived: Way, now: float) -> bool:
-        """Keep `frame`; False when the room is full."""
-        if self._size >= self._capacity:
+        """Keep `frame`; False when the room is full or too many others are being asked for."""
+        if self._size >= self._capacity or (len(self._held) >= self._asks and not self.asked(frame.destination)):
             return False
         self._held.setdefault(frame.destination, []).append(Held(frame, arrived, now + self._hold_s))
         self._size += 1

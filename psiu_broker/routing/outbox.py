@@ -1,7 +1,8 @@
 """What waits for one link: bounded, urgent first, and never late."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Final, NamedTuple
 
 from psiu_broker.frame import Frame, Way
@@ -58,46 +59,47 @@ class Parcel(NamedTuple):
 
 
 class Outbox:
-    """A bounded queue of parcels in three lanes. Every parcel that goes in comes out exactly once:
-    taken, evicted, expired or cleared."""
+    """A bounded queue of parcels in three lanes.
 
-    __slots__ = ("_capacity", "_lanes", "_size")
+    Every parcel that goes in comes out exactly once: taken, evicted, expired or cleared.
+    """
+
+    __slots__ = ("_capacity", "_lanes", "size")
 
     def __init__(self, capacity: int = 64) -> None:
         self._capacity = capacity
         self._lanes: tuple[deque[Parcel], ...] = (deque(), deque(), deque())
-        self._size = 0
+        self.size = 0
 
-    def __len__(self) -> int:
-        return self._size
+    def __iter__(self) -> Iterator[Parcel]:
+        """What waits, in the order in which it would leave."""
+        return chain(*self._lanes)
 
     def put(self, parcel: Parcel) -> Parcel | None:
-        """Queue `parcel`; if there was no room, the parcel that had to go: the oldest of the least urgent lane."""
+        """Queue `parcel`; if there was no room, the one that had to go: the oldest of the least urgent lane."""
         evicted = None
-        if self._size >= self._capacity:
+        if self.size >= self._capacity:
             least = next(lane for lane in reversed(self._lanes) if lane)
             if least[0].lane < parcel.lane:
                 return parcel
             evicted = least.popleft()
-            self._size -= 1
+            self.size -= 1
         self._lanes[parcel.lane].append(parcel)
-        self._size += 1
+        self.size += 1
         return evicted
 
-    def first(self) -> Parcel | None:
-        """The parcel to send next, still in the box."""
+    def take(self) -> Parcel | None:
+        """The next parcel to send."""
         for lane in self._lanes:
             if lane:
-                return lane[0]
+                self.size -= 1
+                return lane.popleft()
         return None
 
-    def remove_first(self) -> None:
-        """Take out what `first` showed."""
-        for lane in self._lanes:
-            if lane:
-                lane.popleft()
-                self._size -= 1
-                return
+    def put_back(self, parcel: Parcel) -> None:
+        """Return what was just taken to the head of its lane."""
+        self._lanes[parcel.lane].appendleft(parcel)
+        self.size += 1
 
     def expire(self, now: float) -> list[Parcel]:
         """Take out what is too late to send."""
@@ -115,9 +117,9 @@ class Outbox:
         taken: list[Parcel] = []
         for lane in self._lanes:
             if any(map(unwanted, lane)):
-                kept = [parcel for parcel in lane if not unwanted(parcel)]
                 taken += [parcel for parcel in lane if unwanted(parcel)]
+                kept = [parcel for parcel in lane if not unwanted(parcel)]
                 lane.clear()
                 lane.extend(kept)
-        self._size -= len(taken)
+        self.size -= len(taken)
         return taken

@@ -1,0 +1,209 @@
+"""The one meeting point: every frame that arrives on any link passes here and has its fate written down."""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from psiu_broker.codecs import psiu_ascii
+from psiu_broker.frame import Address, Frame, Malformed, Way
+from psiu_broker.link import Link
+from psiu_broker.routing.holding import Holding
+from psiu_broker.routing.outbox import Fate
+from psiu_broker.routing.router import SELF, Decision, Port, Router
+from psiu_broker.routing.verdicts import (
+    ANSWERED,
+    DUPLICATE,
+    MALFORMED,
+    NO_ROUTE,
+    Account,
+    Verdict,
+)
+
+
+class Bus(Protocol):
+    """What the exchange needs of the bus. `listened` and `tapped` are read for each frame."""
+
+    listened: bool
+    """Somebody listens to decoded frames."""
+    tapped: bool
+    """Somebody listens to raw frames."""
+
+    def publish(self, frame: Frame, way: Way) -> None: ...
+    def publish_raw(self, frame: Frame | Malformed, way: Way, verdict: Verdict) -> None: ...
+
+
+class Resident(Protocol):
+    """The robot that the broker itself is, and its voice for robots that speak another protocol."""
+
+    def answer(self, frame: Frame, way: Way, now: float) -> None:
+        """A frame for the broker, or for everyone."""
+
+    def translate(self, frame: Frame, way: Way, now: float) -> Verdict:
+        """A frame for a robot of another protocol: ask it in the sender's stead."""
+
+    def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
+        """Bytes that were no frame: perhaps a robot's complaint, perhaps one to make ourselves."""
+
+    def link_opened(self, link: Link, now: float) -> None: ...
+
+    def link_closed(self, link: Link, now: float) -> None: ...
+
+
+class Exchange:
+    """Moves frames between links; implements `link.Hub`.
+
+    For each link, and for the broker's own frames under `SELF`, at every moment:
+    arrived = settled (delivered, answered, dropped) + waiting.
+    """
+
+    def __init__(
+        self,
+        own_name: Address,
+        router: Router,
+        bus: Bus,
+        holding: Holding | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.links: dict[str, Link] = {}
+        self.accounts: dict[str, Account] = {SELF.link: Account()}
+        self.router = router
+        self.holding = holding or Holding()
+        self.resident: Resident
+        self._ports: dict[str, Port] = {}
+        self._own_name = own_name
+        self._bus = bus
+        self._clock = clock
+        self._route = router.route
+
+    def add(self, link: Link, protocol: str, *, wildcard: bool) -> None:
+        """Take in a link; its books start now."""
+        self.links[link.name] = link
+        self.accounts[link.name] = Account()
+        self._ports[link.name] = Port(link.name, protocol, link.ways, wildcard)
+
+    def heard(self, frame: Frame, way: Way, now: float) -> Verdict | None:
+        """A frame from a robot (or, by the way SELF, from the broker): decide, move, count, tell the bus.
+
+        Returns its verdict; None while it waits.
+        """
+        account = self.accounts[way.link]
+        account.arrived += 1
+        decision = self._route(frame, way, now)
+        hops = decision.hops
+        if decision.action == "forward" and len(hops) == 1:
+            hop = hops[0]
+            verdict = self.links[hop.link].offer(frame, hop.peer, way, now)
+        else:
+            verdict = self._carry_out(decision, frame, way, now)
+        if verdict is not None:
+            account.fates[verdict] += 1
+            if self._bus.tapped:
+                self._bus.publish_raw(frame, way, verdict)
+        if self._bus.listened and verdict is not DUPLICATE:
+            self._bus.publish(frame, way)
+        return verdict
+
+    def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
+        account = self.accounts[way.link]
+        account.arrived += 1
+        account.fates[MALFORMED] += 1
+        if self._bus.tapped:
+            self._bus.publish_raw(malformed, way, MALFORMED)
+        self.resident.malformed(malformed, way, now)
+
+    def send(self, frame: Frame, now: float) -> Verdict | None:
+        """Send a frame of the broker's own; its verdict, or None while it waits."""
+        return self.heard(frame, SELF, now)
+
+    def settled(self, fate: Fate, verdict: Verdict, now: float) -> None:
+        final = fate.settle(verdict)
+        if final is not None:
+            self.accounts[fate.arrived.link].fates[final] += 1
+            if self._bus.tapped:
+                self._bus.publish_raw(fate.frame, fate.arrived, final)
+
+    def opened(self, link: Link, now: float) -> None:
+        self.router.link_up(self._ports[link.name])
+        self.resident.link_opened(link, now)
+
+    def closed(self, link: Link, now: float) -> None:
+        self.router.link_down(link.name, now)
+        self.resident.link_closed(link, now)
+
+    def peer_lost(self, way: Way, now: float) -> None:
+        self.router.peer_lost(way, now)
+
+    def release(self, robot: Address, now: float) -> None:
+        """`robot` has been heard: move the frames that waited for it."""
+        for held in self.holding.release(robot):
+            decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
+            verdict = (
+                NO_ROUTE if decision.action == "ask" else self._carry_out(decision, held.frame, held.arrived, now)
+            )
+            if verdict is not None:
+                self.settled(Fate(held.frame, held.arrived), verdict, now)
+
+    def expire(self, now: float) -> None:
+        """Drop what has waited too long, here and in the outboxes."""
+        for held in self.holding.expire(now):
+            self.settled(Fate(held.frame, held.arrived), NO_ROUTE, now)
+        for link in self.links.values():
+            link.expire(now)
+
+    def waiting(self) -> dict[str, int]:
+        """How many of the frames that arrived on each link wait now, in an outbox or for a route."""
+        fates = {id(parcel.fate): parcel.fate for link in self.links.values() for parcel in link.outbox}
+        counts = {name: self.holding.waiting_from(name) for name in self.accounts}
+        for fate in fates.values():
+            counts[fate.arrived.link] += 1
+        return counts
+
+    def _carry_out(self, decision: Decision, frame: Frame, way: Way, now: float) -> Verdict | None:
+        match decision.action:
+            case "forward":
+                return self._spread(frame, decision.hops, way, now)
+            case "flood":
+                return self._flood(frame, decision.hops, way, now)
+            case "answer":
+                self.resident.answer(frame, way, now)
+                return ANSWERED
+            case "translate":
+                return self.resident.translate(frame, way, now)
+            case "ask":
+                return self._ask(frame, decision.hops, way, now)
+            case "drop":
+                return decision.verdict
+
+    def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
+        if way is not SELF:
+            self.resident.answer(frame, way, now)
+        if hops:
+            return self._spread(frame, hops, way, now)
+        return NO_ROUTE if way is SELF else ANSWERED
+
+    def _spread(self, frame: Frame, hops: Iterable[Way], way: Way, now: float) -> Verdict | None:
+        """Send copies several ways; the verdict of the whole, None while a copy waits."""
+        hops = list(hops)
+        fate = Fate(frame, way, len(hops))
+        final: Verdict | None = None
+        for hop in hops:
+            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, fate)
+            if verdict is not None:
+                final = fate.settle(verdict)
+        return final
+
+    def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
+        """Hold a frame for an unknown robot, and ask for the robot by its name, once."""
+        if way is SELF:
+            return NO_ROUTE
+        asked = self.holding.asked(frame.destination)
+        if not self.holding.add(frame, way, now):
+            return NO_ROUTE
+        if not asked:
+            question = psiu_ascii.message(self._own_name, frame.destination, "qualseunome")
+            account = self.accounts[SELF.link]
+            account.arrived += 1
+            verdict = self._spread(question, hops, SELF, now)
+            if verdict is not None:
+                account.fates[verdict] += 1
+        return None

@@ -1,0 +1,61 @@
+from psiu_broker.frame import Way
+from psiu_broker.routing.duplicates import Duplicates
+
+RADIO, WIFI, ARM = Way("radio"), Way("wifi", ("127.0.0.1", 9001)), Way("arm")
+
+
+def test_the_same_frame_by_another_way_within_the_window_is_a_double() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", RADIO, 0.0)
+    assert duplicates.is_double(b"frame", WIFI, 0.5)
+    assert duplicates.is_double(b"frame", ARM, 1.0)
+
+
+def test_the_same_frame_by_the_same_way_is_a_person_pressing_twice() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", RADIO, 0.0)
+    assert not duplicates.is_double(b"frame", RADIO, 0.2)
+
+
+def test_a_double_of_the_second_press_is_still_a_double_whichever_copy_comes_first() -> None:
+    duplicates = Duplicates(1.0)
+    heard = [(RADIO, 0.0), (WIFI, 0.01), (WIFI, 0.20), (RADIO, 0.21), (WIFI, 0.40), (RADIO, 0.41)]
+    passed = [at for way, at in heard if not duplicates.is_double(b"frame", way, at)]
+    assert passed == [0.0, 0.21, 0.41]
+
+
+def test_two_peers_of_one_link_are_two_ways() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", WIFI, 0.0)
+    assert duplicates.is_double(b"frame", Way("wifi", ("127.0.0.1", 9002)), 0.1)
+
+
+def test_after_the_window_another_way_may_bring_it() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", RADIO, 0.0)
+    assert not duplicates.is_double(b"frame", WIFI, 1.1)
+    assert duplicates.is_double(b"frame", RADIO, 1.2)
+
+
+def test_a_robot_that_moved_while_repeating_itself_is_heard_after_one_window() -> None:
+    duplicates = Duplicates(1.0)
+    for tenth in range(50):
+        assert not duplicates.is_double(b"frame", RADIO, tenth / 10)
+    passed = [tenth / 10 for tenth in range(50, 80) if not duplicates.is_double(b"frame", WIFI, tenth / 10)]
+    assert passed[0] <= 6.0
+    assert len(passed) >= 19
+
+
+def test_the_memory_survives_a_change_of_generation() -> None:
+    duplicates = Duplicates(1.0)
+    duplicates.is_double(b"other", RADIO, 0.0)
+    duplicates.is_double(b"frame", RADIO, 0.99)
+    duplicates.is_double(b"other still", RADIO, 1.01)
+    assert duplicates.is_double(b"frame", WIFI, 1.5)
+
+
+def test_memory_is_bounded_under_a_flood_of_different_frames() -> None:
+    duplicates = Duplicates(1.0, capacity=100)
+    for number in range(10_000):
+        duplicates.is_double(number, RADIO, 0.0)
+    assert len(duplicates._new) + len(duplicates._old) <= 200
