@@ -32,15 +32,15 @@ class Decoded(Message):
     destination: str
     protocol: str
     kind: Literal["command", "response", "ping", "ack", "nak", "busy", "available", "free", "wtf", "node", "complex"]
-    command: str | None = Field(None, description="the command word or the node's name")
+    command: str | None = Field(default=None, description="the command word or the node's name")
     parameters: list[Value] = []
     status: Literal["sucesso", "falha"] | None = None
-    node: int | None = Field(None, description="PSIU HEXA: node number, 0 in a sensor's answer")
-    signal: int | None = Field(None, description="PSIU HEXA: the node's signal byte, 0–255")
-    value: float | None = Field(None, description="the signal in the unit of the node's declared type")
+    node: int | None = Field(default=None, description="PSIU HEXA: node number, 0 in a sensor's answer")
+    signal: int | None = Field(default=None, description="PSIU HEXA: the node's signal byte, 0–255")
+    value: float | None = Field(default=None, description="the signal in the unit of the node's declared type")
     unit: str | None = None
-    fields: list[str] | None = Field(None, description="PSIU HEXA complex: the fields in hexadecimal")
-    remark: str | None = Field(None, description="what a tolerant codec forgave, such as a wrong size")
+    fields: list[str] | None = Field(default=None, description="PSIU HEXA complex: the fields in hexadecimal")
+    remark: str | None = Field(default=None, description="what a tolerant codec forgave, such as a wrong size")
     broker: str
     link: str
     received: Moment
@@ -63,14 +63,14 @@ class Card(Message):
     """A robot that the broker knows: ``psiu/{robot}``."""
 
     robot: str
-    address: str | None = Field(None, description="its PSIU HEXA address, where it has one")
+    address: str | None = Field(default=None, description="its PSIU HEXA address, where it has one")
     protocol: str
     broker: str
     link: str
     peer: str | None = None
     link_state: str
     first_heard: Moment | None = None
-    last_heard: Moment | None = Field(None, description="null: configured but never heard")
+    last_heard: Moment | None = Field(default=None, description="null: configured but never heard")
     commands: list[Command] = []
     frames_heard: int = 0
 
@@ -80,8 +80,8 @@ class CallRequest(Message):
 
     model_config = ConfigDict(extra="forbid")
 
-    parameters: list[Value] = Field([], max_length=64)
-    timeout_s: float | None = Field(None, gt=0, le=3600)
+    parameters: list[Value] = Field(default=[], max_length=64)
+    timeout_s: float | None = Field(default=None, gt=0, le=3600)
 
 
 class Answer(Message):
@@ -123,7 +123,7 @@ class Link(Message):
     adapter: str
     protocol: str
     state: Literal["waiting", "opening", "open", "closed"]
-    reason: str | None = Field(None, description="what it waits for, in words")
+    reason: str | None = Field(default=None, description="what it waits for, in words")
     since: Moment
     peers: list[str] = []
     robots: int = 0
@@ -143,7 +143,9 @@ class Route(Message):
     link: str
     peer: str | None = None
     origin: Literal["learned", "static"]
-    age_s: float | None = Field(None, description="since its last checked frame; null for a static route never heard")
+    age_s: float | None = Field(
+        default=None, description="since its last checked frame; null for a static route never heard"
+    )
     expires_in_s: float | None = None
 
 
@@ -154,8 +156,8 @@ class Account(Message):
     arrived: int
     delivered: int
     answered: int
-    dropped: dict[str, int] = Field({}, description="frames by reason")
-    waiting: int = Field(0, description="in an outbox or held for a route at this moment")
+    dropped: dict[str, int] = Field(default={}, description="frames by reason")
+    waiting: int = Field(default=0, description="in an outbox or held for a route at this moment")
 
 
 class Ledger(Message):
@@ -198,6 +200,17 @@ class Why(Message):
 
 
 PUBLISHED: Final[tuple[type[Message], ...]] = (
-    Decoded, Card, CallRequest, Answer, Refusal, RawFrame, Link, Route, Ledger, Status, Health, Why,
+    Decoded,
+    Card,
+    CallRequest,
+    Answer,
+    Refusal,
+    RawFrame,
+    Link,
+    Route,
+    Ledger,
+    Status,
+    Health,
+    Why,
 )
 """The messages of the bus, in the order in which `psiu schema` prints them."""
