@@ -1,0 +1,210 @@
+"""Calls from programs to robots: ``psiu/@call/{robot}/{command}``.
+
+A get is a call: it ends with the robot's `Answer` or a `Refusal`, always. A put is a command sent
+without waiting for either. Zenoh does not tell how long an asker will wait: the deadline is the
+request's `timeout_s`, or the backend's own.
+"""
+
+import asyncio
+import logging
+import math
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any, Final, NamedTuple
+
+import zenoh
+from pydantic import ValidationError
+
+from psiu_broker.bus.keys import Keys
+from psiu_broker.bus.session import Session, json_of, plain
+from psiu_broker.errors import BusError, CallError
+from psiu_broker.frame import Address
+from psiu_broker.messages import Answer, CallRequest, Refusal
+
+logger = logging.getLogger(__name__)
+
+Call = Callable[[Address, str, CallRequest], Awaitable[Answer]]
+"""Send a command and wait for the robot's answer; raises CallError."""
+
+Send = Callable[[Address, str, CallRequest], Awaitable[None]]
+"""Send a command and go on; raises CallError."""
+
+AT_ONCE_MAX: Final = 256
+"""Calls under way or waiting their turn; one more is refused as busy."""
+
+PAYLOAD_MAX: Final = 65_536
+RING: Final = 1024
+
+_ANSWER: Final = json_of("Answer")
+_REFUSAL: Final = json_of("Refusal")
+
+
+class _Accepted(NamedTuple):
+    robot: Address
+    command: str
+    request: CallRequest
+    query: zenoh.Query | None
+
+
+class Calls:
+    """Hands the calls of other programs to the broker and its answers back."""
+
+    def __init__(self, session: Session, keys: Keys, call: Call, send: Send) -> None:
+        self.refused_puts = 0
+        self._session = session
+        self._keys = keys
+        self._call = call
+        self._send = send
+        self._room = threading.BoundedSemaphore(AT_ONCE_MAX)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @classmethod
+    async def open(cls, session: Session, keys: Keys, call: Call, send: Send) -> "Calls":
+        """Take calls from now on. `call` serves gets, `send` puts.
+
+        Raises:
+            BusError: the session is closed or lost.
+        """
+
+        def declare() -> tuple[Any, Any]:
+            ring = zenoh.handlers.RingChannel
+            return (
+                session.zenoh.declare_queryable(keys.every_call, ring(RING)),
+                session.zenoh.declare_subscriber(keys.every_call, ring(RING)),
+            )
+
+        calls = cls(session, keys, call, send)
+        try:
+            queryable, subscriber = await asyncio.to_thread(declare)
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+        session.declared(queryable)
+        session.declared(subscriber)
+        session.bridge(queryable, calls._sift_query, calls._begin, name="bus-calls")
+        session.bridge(subscriber, calls._sift_put, calls._begin, name="bus-call-puts")
+        return calls
+
+    async def close(self) -> None:
+        """Answer every call under way with ``shutting_down``; before `Session.close`."""
+        for task in tuple(self._tasks):
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    def _sift_query(self, query: zenoh.Query) -> _Accepted | None:
+        """What of `query` the loop must see; a refusal is answered here, off the loop."""
+        try:
+            _refuse_parameters(query.parameters)
+            return self._accepted(str(query.key_expr), query.payload, query)
+        except CallError as error:
+            refuse(query, error)
+            return None
+
+    def _sift_put(self, sample: zenoh.Sample) -> _Accepted | None:
+        if sample.kind is not zenoh.SampleKind.PUT:
+            return None
+        try:
+            return self._accepted(str(sample.key_expr), sample.payload, None)
+        except CallError as error:
+            self._refused_put(str(sample.key_expr), error)
+            return None
+
+    def _accepted(self, key: str, payload: zenoh.ZBytes | None, query: zenoh.Query | None) -> _Accepted:
+        try:
+            robot, command = self._keys.read_call(key)
+        except ValueError as error:
+            raise CallError("bad_request", str(error)) from error
+        request = read_request(payload.to_bytes() if payload is not None else b"")
+        if not self._room.acquire(blocking=False):
+            raise CallError("busy", f"{AT_ONCE_MAX} calls are under way already")
+        return _Accepted(robot, command, request, query)
+
+    def _begin(self, accepted: _Accepted) -> None:
+        work = self._serve_put(accepted) if accepted.query is None else self._serve(accepted, accepted.query)
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        self._room.release()
+
+    async def _serve(self, accepted: _Accepted, query: zenoh.Query) -> None:
+        try:
+            answer = await self._call(accepted.robot, accepted.command, accepted.request)
+            reply = self._session.off_loop(_answer, query, answer)
+        except CallError as error:
+            reply = self._session.off_loop(refuse, query, error)
+        except asyncio.CancelledError:
+            stopping = CallError("shutting_down", "the broker is stopping; the command may have been carried out")
+            reply = self._session.off_loop(refuse, query, stopping)
+        except Exception as error:
+            logger.exception("a call to %s %s failed inside the broker", accepted.robot, accepted.command)
+            failed = CallError("outcome_unknown", f"the broker failed ({type(error).__name__}); its log says how")
+            reply = self._session.off_loop(refuse, query, failed)
+        try:
+            await reply
+        except BaseException as error:
+            if not self._session.panicked(error):
+                raise
+
+    async def _serve_put(self, accepted: _Accepted) -> None:
+        try:
+            await self._send(accepted.robot, accepted.command, accepted.request)
+        except CallError as error:
+            self._refused_put(self._keys.call(accepted.robot, accepted.command), error)
+        except Exception:
+            logger.exception("a put to %s %s failed inside the broker", accepted.robot, accepted.command)
+
+    def _refused_put(self, key: str, error: CallError) -> None:
+        self.refused_puts += 1
+        logger.debug("a put to %s was refused: %s", key, error)
+
+
+def read_request(payload: bytes) -> CallRequest:
+    """The request in a payload; none at all means no parameters.
+
+    Raises:
+        CallError: bad_request, saying what was expected.
+    """
+    if len(payload) > PAYLOAD_MAX:
+        raise CallError("bad_request", f"a payload of {len(payload)} bytes; {PAYLOAD_MAX} at most")
+    if not payload:
+        return CallRequest()
+    try:
+        request = CallRequest.model_validate_json(payload)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        place = ".".join(str(part) for part in first["loc"][:2])
+        raise CallError(
+            "bad_request", f'expected {{"parameters": [100], "timeout_s": 5}}; {place or "payload"}: {first["msg"]}'
+        ) from error
+    if any(isinstance(value, float) and not math.isfinite(value) for value in request.parameters):
+        raise CallError("bad_request", "parameters: a number must be finite")
+    return request
+
+
+def refuse(query: zenoh.Query, error: CallError) -> None:
+    """End `query` with an error reply; may wait for a slow asker."""
+    with query:
+        refusal = Refusal(error=error.code, message=str(error))
+        _unless_closed(query.reply_err, refusal.model_dump_json(), encoding=_REFUSAL)
+
+
+def _answer(query: zenoh.Query, answer: Answer) -> None:
+    with query:
+        _unless_closed(query.reply, query.key_expr, answer.model_dump_json(), encoding=_ANSWER)
+
+
+def _unless_closed(reply: Callable[..., None], *arguments: object, encoding: zenoh.Encoding) -> None:
+    try:
+        reply(*arguments, encoding=encoding)
+    except zenoh.ZError as error:
+        logger.debug("a reply found no asker: %s", plain(error))
+
+
+def _refuse_parameters(parameters: zenoh.Parameters) -> None:
+    """Raise CallError for ``?100`` behind the key: a command must not go out without what was meant for it."""
+    names = (part.partition("=")[0] for part in str(parameters).split(";") if part)
+    if any(not name.startswith("_") for name in names):  # those of Zenoh itself begin so
+        raise CallError("bad_request", 'parameters go into the payload: {"parameters": [100]}')

@@ -1,0 +1,188 @@
+"""A program on the bus: what the `psiu` tool uses. Everything here waits; nothing needs an event loop."""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Any, Final, Literal
+
+import zenoh
+from pydantic import ValidationError
+from pydantic_core import from_json
+
+from psiu_broker.bus.keys import KEY_LENGTH_MAX, Keys
+from psiu_broker.bus.session import JSON, plain
+from psiu_broker.errors import BusError, CallError, PsiuError
+from psiu_broker.frame import Address
+from psiu_broker.messages import Answer, CallRequest, Card, Refusal, Status
+
+OPEN_TIMEOUT_S: Final = 2.5
+"""Opening cannot be interrupted by Ctrl-C, so it may not take long."""
+
+CALL_TIMEOUT_S: Final = 60.0
+"""How long an answer is awaited where the request sets no deadline: more than any broker's own."""
+
+DEADLINE_MARGIN_S: Final = 1.0
+"""What the broker may take, beyond the request's deadline, to say that it passed."""
+
+
+class Client:
+    """One connection to the first of some brokers that answers; a context manager.
+
+    Methods raise BusError where the connection or the key is at fault.
+    """
+
+    def __init__(self, connect: Sequence[str], prefix: str = "psiu") -> None:
+        """Connect to one of the endpoints `connect`.
+
+        Raises:
+            BusError: nobody answers there within `OPEN_TIMEOUT_S`.
+        """
+        self.keys: Final = Keys(prefix)
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(_configuration(connect))))
+        except zenoh.ZError as error:
+            if "Unable to connect" in str(error):
+                places = " or ".join(connect)
+                raise BusError(f"no broker answers at {places}; is psiu-broker running?") from error
+            raise BusError(f"zenoh: {plain(error)}") from error
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus; harmless twice."""
+        with suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def get_json(self, key: str, timeout_s: float = 3.0) -> dict[str, Any]:
+        """The JSON values that `key` (wildcards allowed) finds, by their own keys; empty if nobody answers.
+
+        Raises:
+            CallError: the only answer was a refusal.
+        """
+        return {found: from_json(payload) for found, payload in self._get(key, timeout_s)}
+
+    def ask(self, *what: str, broker: str | None = None, timeout_s: float = 3.0) -> dict[str, Any]:
+        """``ask("links")`` or ``ask("why", "A", "B")`` of one broker or all: the JSON values by broker.
+
+        Raises:
+            CallError: the only answer was a refusal.
+        """
+        key = self.keys.every_broker(*what) if broker is None else self.keys.broker(broker, *what)
+        return {self.keys.read_broker(found)[0]: value for found, value in self.get_json(key, timeout_s).items()}
+
+    def brokers(self, timeout_s: float = 3.0) -> list[Status]:
+        """The status of every broker on the bus, by name."""
+        key = self.keys.every_broker("status")
+        found = [Status.model_validate_json(payload) for _, payload in self._get(key, timeout_s)]
+        return sorted(found, key=lambda status: status.broker)
+
+    def cards(self, timeout_s: float = 3.0) -> list[Card]:
+        """The robots that the brokers know, by name."""
+        found = [Card.model_validate_json(payload) for _, payload in self._get(self.keys.every_card, timeout_s)]
+        return sorted(found, key=lambda card: card.robot)
+
+    def call(self, robot: Address | str, command: str, request: CallRequest | None = None) -> Answer:
+        """Send a command and wait for the robot's answer.
+
+        Raises:
+            CallError: there was none, and why.
+        """
+        request = request or CallRequest()
+        wait_s = CALL_TIMEOUT_S if request.timeout_s is None else request.timeout_s + DEADLINE_MARGIN_S
+        found = self._get(self._call_key(robot, command), wait_s, request.model_dump_json(exclude_none=True))
+        if not found:
+            raise CallError("no_answer", "no broker on the bus takes calls")
+        try:
+            return Answer.model_validate_json(found[0][1])
+        except ValidationError as error:
+            raise CallError("outcome_unknown", "the broker answered in a form that this program cannot read") from error
+
+    def put_call(self, robot: Address | str, command: str, request: CallRequest | None = None) -> None:
+        """Send a command and go on; whether it arrived is not told."""
+        request = request or CallRequest()
+        try:
+            self._session.put(
+                self._call_key(robot, command),
+                request.model_dump_json(exclude_none=True),
+                encoding=JSON,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+
+    def monitor(self, key: str) -> Iterator[tuple[str, Literal["put", "delete"], bytes]]:
+        """Every put and delete under `key` (wildcards allowed) as key, kind and payload, until interrupted."""
+        try:
+            with self._session.declare_subscriber(_checked(key), zenoh.handlers.RingChannel(65_536)) as subscriber:
+                for sample in subscriber:
+                    kind: Literal["put", "delete"] = "delete" if sample.kind is zenoh.SampleKind.DELETE else "put"
+                    yield str(sample.key_expr), kind, sample.payload.to_bytes()
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+
+    def _call_key(self, robot: Address | str, command: str) -> str:
+        return _checked(self.keys.call(Address.parse(robot) if isinstance(robot, str) else robot, command))
+
+    def _get(self, key: str, timeout_s: float, payload: str | None = None) -> list[tuple[str, bytes]]:
+        """The answers to a get; a refusal counts only where it is the only answer."""
+        found: list[tuple[str, bytes]] = []
+        refusals: list[PsiuError] = []
+        try:
+            replies = self._session.get(
+                _checked(key),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                payload=payload,
+                encoding=JSON if payload is not None else None,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    found.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+                elif reply.err is not None:
+                    refusals.append(_refusal(reply.err.payload.to_bytes(), timeout_s))
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+        if not found and refusals:
+            # Of several brokers, the one that knows the robot has the more to say.
+            raise min(refusals, key=lambda error: isinstance(error, CallError) and error.code == "unknown_robot")
+        return found
+
+
+def _configuration(connect: Sequence[str]) -> dict[str, object]:
+    return {
+        "mode": "client",
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": int(OPEN_TIMEOUT_S * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        },
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+
+
+def _checked(key: str) -> str:
+    """`key`, if Zenoh can carry it; a key that is too long would break the connection."""
+    if len(key.encode(errors="replace")) > KEY_LENGTH_MAX:
+        raise BusError(f"a key of {len(key)} characters is too long")
+    try:
+        zenoh.KeyExpr(key)
+    except (zenoh.ZError, UnicodeEncodeError) as error:
+        raise BusError(f"not a key: {plain(error)}") from error
+    return key
+
+
+def _refusal(payload: bytes, timeout_s: float) -> PsiuError:
+    try:
+        refusal = Refusal.model_validate_json(payload)
+    except ValidationError:
+        if payload == b"Timeout":
+            return CallError("outcome_unknown", f"the broker did not answer within {timeout_s:g} s")
+        return CallError("outcome_unknown", f"the broker answered: {payload[:200].decode(errors='replace')}")
+    return CallError(refusal.error, refusal.message)

@@ -1,0 +1,173 @@
+"""The broker's Zenoh session: opened, watched, and closed whatever happens."""
+
+import asyncio
+import atexit
+import json
+import logging
+import re
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any, Final, Protocol, TypeVar
+
+import zenoh
+
+from psiu_broker.bus.bridge import Bridge
+from psiu_broker.errors import BusError
+
+T = TypeVar("T")
+Kept = TypeVar("Kept")
+Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
+
+_SOURCE_PLACE: Final = re.compile(r"\s*at /[^\s\]]+\.rs:\d+\.?")
+_BUSY: Final = re.compile(r"bound to (?P<endpoint>\S+): .*(?:already in use|os error 98)", re.DOTALL)
+_THREAD_END_S: Final = 5.0
+
+JSON: Final = zenoh.Encoding.APPLICATION_JSON
+
+
+def json_of(name: str) -> zenoh.Encoding:
+    """The encoding of a message: ``application/json;psiu/Decoded``."""
+    return JSON.with_schema(f"psiu/{name}")
+
+
+def plain(error: BaseException) -> str:
+    """Zenoh's words without the places in its source code."""
+    return _SOURCE_PLACE.sub("", str(error)).strip()
+
+
+class Declared(Protocol):
+    """What `Session` undeclares when it closes."""
+
+    def undeclare(self) -> None: ...
+
+
+class Session:
+    """One open Zenoh session, its threads and its declarations.
+
+    `zenoh` is for this folder. After a panic inside Zenoh the session is dead: `lost` is told once,
+    on the loop, and another must be opened.
+    """
+
+    def __init__(self, session: zenoh.Session, listen: Sequence[str], lost: Callable[[BusError], None]) -> None:
+        self.zenoh = session
+        self.zenoh_id: Final = str(session.zid())
+        self.listen: Final = tuple(listen)
+        self.is_lost = False
+        self._lost = lost
+        self._loop = asyncio.get_running_loop()
+        # A reply to a stopped client waits up to five seconds for room: never on the loop.
+        self._workers = ThreadPoolExecutor(4, "psiu-bus-reply")
+        self._declared: list[Declared] = []
+        self._bridges: list[Bridge[Any, Any]] = []
+        # Our reader threads must be out of Zenoh before the interpreter goes, also after an error.
+        atexit.register(self._close)
+
+    @classmethod
+    async def open(
+        cls,
+        listen: Sequence[str],
+        connect: Sequence[str] = (),
+        *,
+        lost: Callable[[BusError], None] = lambda error: None,
+    ) -> "Session":
+        """Listen at `listen` and keep trying to reach `connect`.
+
+        Raises:
+            BusError: an endpoint is taken, impossible or misspelt.
+        """
+        try:
+            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect)))
+            session = await asyncio.to_thread(zenoh.open, config)
+        except Exception as error:
+            raise BusError(_open_problem(error)) from error
+        except BaseException as error:
+            if not _is_panic(error):
+                raise
+            raise BusError(f"zenoh: {plain(error)}") from error
+        return cls(session, listen, lost)
+
+    def declared(self, what: Declared) -> None:
+        """Keep `what` alive until `close`, which undeclares it."""
+        self._declared.append(what)
+
+    def bridge(
+        self, source: Iterable[T], sift: Callable[[T], Kept | None], handle: Callable[[Kept], None], *, name: str
+    ) -> Bridge[T, Kept]:
+        """A `Bridge` whose thread `close` waits for."""
+        bridge = Bridge(source, sift, handle, name=name, failed=self._reader_failed)
+        self._bridges.append(bridge)
+        return bridge
+
+    def off_loop(self, work: Callable[..., Result], *arguments: object) -> "asyncio.Future[Result]":
+        """Run what may wait for a slow program, such as a reply, in a worker thread."""
+        return self._loop.run_in_executor(self._workers, work, *arguments)
+
+    def panicked(self, error: BaseException) -> bool:
+        """True if `error` is a panic inside Zenoh: the session is given up and `lost` is told. Any thread."""
+        if not _is_panic(error):
+            return False
+        if not self.is_lost:
+            self.is_lost = True
+            logger.error("the Zenoh session is lost: %s", plain(error))
+            with suppress(RuntimeError):  # the loop is closed: nobody is left to tell
+                self._loop.call_soon_threadsafe(self._lost, BusError(f"the Zenoh session was lost: {plain(error)}"))
+        return True
+
+    async def close(self) -> None:
+        """Undeclare and close everything and wait for the threads; harmless twice, never raises."""
+        await asyncio.to_thread(self._close)
+
+    def _close(self) -> None:
+        atexit.unregister(self._close)
+        close: Callable[[], None] = self.zenoh.close
+        for end in (*(what.undeclare for what in reversed(self._declared)), close):
+            try:
+                end()
+            except Exception as error:
+                logger.debug("closing the bus: %s", plain(error))
+            except BaseException as error:
+                if not _is_panic(error):
+                    raise
+                logger.debug("closing the bus: %s", plain(error))
+        self._declared.clear()
+        for bridge in self._bridges:
+            bridge.join(_THREAD_END_S)
+        self._bridges.clear()
+        self._workers.shutdown(wait=True)
+
+    def _reader_failed(self, error: BaseException) -> None:
+        if not self.panicked(error):
+            logger.debug("a reader of the bus ended: %s", plain(error))
+
+
+def _is_panic(error: BaseException) -> bool:
+    # Its class cannot be imported; a BaseException, so that `except Exception` passes it by.
+    return type(error).__name__ == "PanicException"
+
+
+def _configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, object]:
+    return {
+        "mode": "peer",
+        "listen": {"endpoints": list(listen), "exit_on_failure": True},
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": -1,  # 0 would never try again
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": 250, "period_max_ms": 4000, "period_increase_factor": 2},
+        },
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {"tx": {"lease": 2000, "keep_alive": 4}},
+        },
+    }
+
+
+def _open_problem(error: Exception) -> str:
+    busy = _BUSY.search(str(error))
+    if busy:
+        return f"zenoh.listen: {busy['endpoint']} is in use (another broker?)"
+    return f"zenoh: {plain(error)}"
