@@ -1,6 +1,7 @@
 """A stream over a non-blocking file descriptor: what serial ports and RFCOMM connections have in common."""
 
 import asyncio
+import errno
 import os
 from collections.abc import Callable, Collection
 
@@ -9,6 +10,7 @@ from psiu_broker.errors import LinkError, LinkLost
 
 READ_BYTES = 4096
 BITS_A_BYTE = 10
+UNPLUGGED = {errno.EIO, errno.ENODEV, errno.ENXIO}
 
 WIRE_SLACK_S = 0.002
 """The event loop's timers come up to this late; without the slack a fast line would idle between frames."""
@@ -27,7 +29,7 @@ class DescriptorTransport(Transport):
     and every error except "try again" are `LinkLost`; `name` begins its text.
     """
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         fd: int,
         receiver: Receiver,
@@ -134,7 +136,7 @@ class DescriptorTransport(Transport):
             self._received(data, self._peer)
         else:
             self._stop()
-            self._say_lost(LinkLost(f"{self._name}: gone (end of file)"))
+            self._say_lost(LinkLost(f"{self._name}: gone (unplugged or disconnected)"))
 
     def _flush(self) -> None:
         """The descriptor has room: finish the frame that was cut, then say so."""
@@ -172,7 +174,8 @@ class DescriptorTransport(Transport):
             self._receiver.lost(error)
 
     def _lost(self, error: OSError) -> LinkLost:
-        return LinkLost(f"{self._name}: gone ({os.strerror(error.errno or 0).lower()})")
+        reason = "unplugged or disconnected" if error.errno in UNPLUGGED else os.strerror(error.errno or 0).lower()
+        return LinkLost(f"{self._name}: gone ({reason})")
 
     def _stop(self) -> None:
         """Leave the descriptor alone from now on: nothing is read, written or said."""
