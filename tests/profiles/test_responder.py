@@ -1,0 +1,188 @@
+"""The broker as a robot: what it answers, and the loops that it never starts."""
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.frame import EVERYONE, Address, Frame
+from psiu_broker.messages import Answer, Command
+from psiu_broker.profiles import HexaProfile, Node, Responder
+from psiu_broker.profiles.psiu import said
+from psiu_broker.profiles.responder import listing, outcome, refusal
+
+BASE = Address.named("base")
+PC = Address.named("PC")
+ARM = Address.numbered(0x12)
+OURS = Address.numbered(1)
+
+
+def ask(message: str, destination: Address = BASE, source: Address = PC) -> Frame:
+    return psiu_ascii.message(source, destination, *message.split())
+
+
+def answered(message: str, destination: Address = BASE, now: float = 0.0) -> str | None:
+    answer = Responder("base").answer(ask(message, destination), now)
+    if answer is None:
+        return None
+    assert (answer.source, answer.destination) == (BASE, PC)
+    return answer.payload.decode()
+
+
+@pytest.mark.parametrize(
+    ("message", "answer"),
+    [
+        ("quantoscomandos", "quantoscomandos 3"),
+        ("exibecomando 1", "exibecomando qualseunome 0 0 0"),
+        ("exibecomandos 3", "exibecomando exibecomando 1 0 0"),
+        ("exibecomando 0", "exibecomando falha"),
+        ("exibecomando 4", "exibecomando falha"),
+        ("exibecomando", "exibecomando falha"),
+        ("parafrente 100", "parafrente falha"),
+    ],
+)
+def test_the_broker_is_a_robot_with_three_commands(message: str, answer: str) -> None:
+    assert answered(message) == answer
+
+
+def test_the_broker_tells_its_name_to_everyone_who_asks() -> None:
+    assert answered("qualseunome", EVERYONE) == "qualseunome"
+
+
+def test_a_command_to_everyone_is_not_refused() -> None:
+    assert answered("parafrente 100", EVERYONE) is None
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "parafrente sucesso",
+        "parafrente falha",
+        "parafrente OK",
+        "quantoscomandos 6",
+        "exibecomando parafrente 1 0 0",
+        "qualseunome",
+    ],
+)
+def test_an_answer_is_never_answered(message: str) -> None:
+    assert answered(message) is None
+
+
+def test_a_late_value_of_a_robot_that_takes_falha_for_a_command_ends_the_talk() -> None:
+    responder = Responder("base")
+    frame = ask("distancia 42")
+    assert responder.answer(frame, 0.0) is not None
+    assert responder.answer(frame, 0.5) is None
+    assert responder.answer(frame, 1.9) is None
+    assert responder.answer(ask("luz 3"), 1.9) is not None
+    assert responder.answer(frame, 2.1) is not None
+
+
+def test_a_ping_is_answered_at_most_once_in_100_ms_for_each_robot() -> None:
+    responder = Responder("base")
+    ping = psiu_hexa.packet(ARM, OURS, b"")
+    answer = responder.answer(ping, 0.0)
+    assert answer is not None
+    assert (answer.source, answer.destination, answer.payload) == (OURS, ARM, b"")
+    assert responder.answer(ping, 0.05) is None
+    assert responder.answer(psiu_hexa.packet(Address.numbered(0x13), OURS, b""), 0.05) is not None
+    assert responder.answer(ping, 0.11) is not None
+
+
+def test_a_ping_that_answers_ours_is_not_answered() -> None:
+    responder = Responder("base")
+    assert responder.answer(psiu_hexa.packet(ARM, OURS, b""), 0.0, pinging=True) is None
+
+
+@pytest.mark.parametrize(
+    ("payload", "answer"),
+    [
+        (b"?", b"F"),
+        (bytes((0, 42)), b"W"),
+        (bytes((4, 42)), b"W"),
+        (bytes((1, 1, 0x55)), b"W"),
+        (bytes((9, 9, 0x55)), b"W"),
+        (b"A", None),
+        (b"N", None),
+        (b"B", None),
+        (b"F", None),
+        (b"W", None),
+        (b"\xc8", None),
+    ],
+)
+def test_packets_to_the_broker(payload: bytes, answer: bytes | None) -> None:
+    told = Responder("base").answer(psiu_hexa.packet(ARM, OURS, payload), 0.0)
+    assert (None if told is None else told.payload) == answer
+    assert told is None or (told.source, told.destination) == (OURS, ARM)
+
+
+def test_a_frame_of_another_protocol_is_left_alone() -> None:
+    assert Responder("base").answer(Frame(PC, BASE, "x", b"x", "mitya"), 0.0) is None
+
+
+def packets() -> Iterator[bytes]:
+    yield b""
+    yield from (bytes((byte,)) for byte in range(256))
+    yield bytes((0, 1))
+    yield bytes((1, 1, 1))
+
+
+@pytest.mark.parametrize("first", [*packets()])
+def test_two_brokers_fall_silent_after_a_packet(first: bytes) -> None:
+    one, other = Responder("one"), Responder("other")
+    frame: Frame | None = psiu_hexa.packet(ARM, OURS, first)
+    for step in range(6):
+        if frame is None:
+            return
+        frame = (one, other)[step % 2].answer(frame, step * 0.02)
+    pytest.fail("they still talk")
+
+
+@given(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60), st.booleans())
+def test_two_brokers_fall_silent_after_any_words_and_never_raise(message: str, everyone: bool) -> None:
+    one, other = Responder("base"), Responder("PC")
+    frame: Frame | None = Frame(PC, EVERYONE if everyone else BASE, "", message.encode(), "psiu-ascii")
+    for step in range(4):
+        if frame is None:
+            return
+        frame = (one, other)[step % 2].answer(frame, step * 10.0)
+    pytest.fail("they still talk")
+
+
+def test_the_responder_remembers_a_bounded_number_of_robots() -> None:
+    responder = Responder("base")
+    for number in range(5000):
+        responder.answer(ask("x", source=Address.named(f"R{number}")), 0.0)
+    assert len(responder._last) <= 256
+
+
+def test_a_hexa_robots_nodes_are_listed_for_an_ascii_asker() -> None:
+    commands = HexaProfile({"garra": Node(node=4, type="servo")}).commands()
+
+    def told(message: str) -> str | None:
+        answer = listing(ask(message, Address.named("BRACO")), "BRACO", commands)
+        return None if answer is None else f"{answer.source} {answer.payload.decode()}"
+
+    assert told("quantoscomandos") == "BRACO quantoscomandos 4"
+    assert told("exibecomando 2") == "BRACO exibecomando garra 0 1 0"
+    assert told("exibecomando 5") == "BRACO exibecomando falha"
+    assert told("garra 45") is None
+    assert told("quantoscomandos 4") is None
+    assert told("qualseunome") is None
+
+
+def test_a_call_made_for_an_ascii_robot_is_answered_in_its_words() -> None:
+    frame = ask("garra 45", Address.named("BRACO"))
+    assert outcome(frame, "BRACO", Answer(status="sucesso", elapsed_ms=1)).payload == b"garra sucesso"
+    assert outcome(frame, "BRACO", Answer(values=[42, 1.5], elapsed_ms=1)).payload == b"garra 42 1.5"
+    told = refusal(frame, "BRACO")
+    assert (told.source, told.destination, told.payload) == (Address.named("BRACO"), PC, b"garra falha")
+
+
+def test_a_broker_with_more_commands_lists_them() -> None:
+    responder = Responder("base", [Command(name="acorde")])
+    answer = responder.answer(ask("exibecomando 1"), 0.0)
+    assert answer is not None
+    assert said(answer).values == ("acorde", 0, 0, 0)
