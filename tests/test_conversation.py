@@ -1,0 +1,554 @@
+"""Calls to robots: tries, turns and deadlines, on a clock that jumps instead of waiting."""
+
+import asyncio
+import functools
+import selectors
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from typing import Any
+
+import pytest
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.conversation import WAITING_KEPT, Conversations
+from psiu_broker.errors import CallError, EncodeError
+from psiu_broker.frame import Address, Frame
+from psiu_broker.messages import Answer, Value
+from psiu_broker.profiles import HexaProfile, Node, PsiuProfile, Request
+
+BASE = Address.named("base")
+MNERIM = Address.named("MNERIM")
+OURS = Address.numbered(1)
+ARM = Address.numbered(0x12)
+
+
+class JumpingSelector(selectors.DefaultSelector):
+    """Where the loop would sleep, its clock jumps."""
+
+    jumped_s = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        assert timeout is not None, "nothing is left that could wake the loop"
+        self.jumped_s += max(timeout, 0.0)
+        return super().select(0)
+
+
+class JumpingLoop(asyncio.SelectorEventLoop):
+    """An event loop whose time is what its timers make of it."""
+
+    def __init__(self) -> None:
+        self._jumping = JumpingSelector()
+        super().__init__(self._jumping)
+
+    def time(self) -> float:
+        return 1000.0 + self._jumping.jumped_s
+
+
+def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Run an async test on a jumping clock."""
+
+    @functools.wraps(test)
+    def run(*args: Any, **kwargs: Any) -> None:
+        with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+            runner.run(test(*args, **kwargs))
+
+    return run
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+class Robots:
+    """A broker's worth of calls to scripted robots: `script` says what each frame sent is answered with."""
+
+    def __init__(self, **options: Any) -> None:
+        self.conversations = Conversations(self._send, **options)
+        self.sent: list[tuple[float, bytes]] = []
+        self.ages: list[float] = []
+        self.refuse: CallError | None = None
+        self.script: Callable[[Frame], Sequence[tuple[float, bytes]]] = lambda _: ()
+        self.begun = now()
+
+    def _send(self, frame: Frame, age_s: float) -> CallError | None:
+        if self.refuse is not None:
+            return self.refuse
+        self.sent.append((round(now() - self.begun, 6), frame.payload))
+        self.ages.append(round(age_s, 6))
+        for delay_s, payload in self.script(frame):
+            answer = frame._replace(source=frame.destination, destination=frame.source, subject="", payload=payload)
+            asyncio.get_running_loop().call_later(delay_s, self.say, answer)
+        return None
+
+    def say(self, frame: Frame) -> bool:
+        return self.conversations.heard(frame, now())
+
+    async def ascii(self, command: str, *parameters: Value, address: Address = MNERIM, **more: Any) -> Answer:
+        def build(request: Request) -> Frame:
+            return psiu_ascii.message(BASE, address, *request.payload.decode().split())
+
+        return await self.conversations.call(
+            robot=str(address), own=BASE, address=address, profile=PsiuProfile(), build=build,
+            command=command, parameters=parameters, **{"link": "radio", **more},
+        )  # fmt: skip
+
+    async def hexa(self, command: str, *parameters: Value, **more: Any) -> Answer:
+        nodes = {"garra": Node(node=4, type="servo"), "sonar": Node(node=7, type="distance", unit="cm")}
+        return await self.conversations.call(
+            robot="BRACO", own=OURS, address=ARM, profile=HexaProfile(nodes),
+            build=lambda request: psiu_hexa.packet(OURS, ARM, request.payload),
+            command=command, parameters=parameters, **{"link": "arm", **more},
+        )  # fmt: skip
+
+    @property
+    def idle(self) -> bool:
+        return not self.conversations._lanes and not self.conversations._under_way
+
+
+async def refused(call: Awaitable[Answer]) -> CallError:
+    with pytest.raises(CallError) as caught:
+        await call
+    return caught.value
+
+
+@jumping
+async def test_a_call_returns_the_robots_answer_and_how_long_it_took() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.25, b"parafrente sucesso")]
+    answer = await robots.ascii("parafrente", 100)
+    assert (answer.status, answer.values, answer.elapsed_ms) == ("sucesso", [], pytest.approx(250))
+    assert robots.sent == [(0.0, b"parafrente 100")]
+    assert robots.idle
+
+
+@jumping
+async def test_a_falha_is_an_answer() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.1, b"parafrente FALHA")]
+    assert (await robots.ascii("parafrente", 100)).status == "falha"
+
+
+@jumping
+async def test_a_value_comes_typed_and_with_its_unit() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.1, bytes((0, 42)))]
+    answer = await robots.hexa("sonar")
+    assert (answer.status, answer.values, answer.unit) == (None, [42], "cm")
+
+
+@jumping
+async def test_a_robot_that_answers_before_send_returns_is_heard() -> None:
+    robots = Robots()
+
+    def at_once(frame: Frame) -> Sequence[tuple[float, bytes]]:
+        robots.say(Frame(MNERIM, BASE, "quantoscomandos", b"quantoscomandos 6", "psiu-ascii"))
+        return ()
+
+    robots.script = at_once
+    assert (await robots.ascii("quantoscomandos")).values == [6]
+
+
+@jumping
+async def test_a_question_is_asked_again_on_silence_and_then_given_up() -> None:
+    robots = Robots()
+    error = await refused(robots.ascii("quantoscomandos"))
+    assert (error.code, str(error)) == ("no_answer", "no answer from MNERIM after 3 tries")
+    assert [at for at, _ in robots.sent] == pytest.approx([0, 2, 4])
+    assert now() - robots.begun == pytest.approx(6)
+    assert robots.idle
+
+
+@jumping
+async def test_a_late_answer_to_the_second_try_is_an_answer() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.5, b"quantoscomandos 6")] if len(robots.sent) == 2 else ()
+    answer = await robots.ascii("quantoscomandos")
+    assert (answer.values, answer.elapsed_ms) == ([6], pytest.approx(2500))
+
+
+@jumping
+async def test_motion_is_never_repeated_on_silence() -> None:
+    robots = Robots()
+    error = await refused(robots.ascii("parafrente", 100))
+    assert error.code == "outcome_unknown"
+    assert "MNERIM did not answer parafrente in 3.2 s" in str(error)
+    assert robots.sent == [(0.0, b"parafrente 100")]
+    assert now() - robots.begun == pytest.approx(3.2)
+    assert robots.idle
+
+
+@jumping
+async def test_the_callers_deadline_is_kept_and_a_longer_one_waits_longer() -> None:
+    robots = Robots()
+    assert (await refused(robots.ascii("parafrente", 100, timeout_s=0.5))).code == "outcome_unknown"
+    assert now() - robots.begun == pytest.approx(0.5)
+    error = await refused(robots.ascii("quantoscomandos", timeout_s=0.5))
+    assert (error.code, str(error)) == ("no_answer", "no answer from MNERIM after 1 try")
+    assert now() - robots.begun == pytest.approx(1.0)
+    robots.script = lambda _: [(29, b"parafrente sucesso")]
+    assert (await robots.ascii("parafrente", 100, timeout_s=30)).status == "sucesso"
+
+
+@jumping
+async def test_a_frame_may_wait_in_its_outbox_no_longer_than_its_try() -> None:
+    robots = Robots()
+    await refused(robots.ascii("quantoscomandos", timeout_s=5))
+    assert robots.ages == pytest.approx([2, 2, 1])
+
+
+@jumping
+async def test_what_cannot_be_asked_is_refused_before_sending() -> None:
+    robots = Robots()
+    error = await refused(robots.ascii("parafrente", 1200))
+    assert (error.code, str(error)) == ("refused", "parafrente takes 0–999 cm, got 1200")
+    assert (await refused(robots.hexa("gara"))).code == "unknown_command"
+    assert robots.sent == []
+    assert robots.idle
+
+
+@jumping
+async def test_a_frame_that_cannot_go_fails_at_once_with_the_reason() -> None:
+    robots = Robots()
+    robots.refuse = CallError("link_down", "link radio is down since 03:04")
+    assert await refused(robots.ascii("parafrente", 100)) is robots.refuse
+    assert now() == robots.begun
+    assert robots.idle
+
+
+@jumping
+async def test_a_frame_that_the_protocol_cannot_say_is_refused() -> None:
+    robots = Robots()
+
+    def build(request: Request) -> Frame:
+        raise EncodeError("the frame would be 1003 bytes")
+
+    call = robots.conversations.call(
+        robot="MNERIM", own=BASE, address=MNERIM, profile=PsiuProfile(), build=build,
+        command="x", parameters=[], link="radio",
+    )  # fmt: skip
+    error = await refused(call)
+    assert (error.code, str(error)) == ("refused", "x cannot be sent to MNERIM: the frame would be 1003 bytes")
+    assert robots.idle
+
+
+@jumping
+async def test_a_frame_dropped_from_its_outbox_ends_the_call() -> None:
+    robots = Robots()
+    task = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0.1)
+    expired = CallError("expired", "it waited too long")
+    robots.conversations.undelivered(psiu_ascii.message(BASE, MNERIM, "parafrente", "50"), expired)
+    await asyncio.sleep(0.1)
+    assert not task.done()
+    robots.conversations.undelivered(psiu_ascii.message(BASE, MNERIM, "parafrente", "100"), expired)
+    assert await refused(task) is expired
+
+
+@jumping
+async def test_a_complaint_has_motion_sent_again_once_the_robot_is_quiet() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.3, b"parafrente sucesso")] if len(robots.sent) == 2 else ()
+    task = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    for _ in range(3):
+        await asyncio.sleep(0.01)
+        robots.conversations.complained("radio")
+    assert (await task).status == "sucesso"
+    assert [at for at, _ in robots.sent] == pytest.approx([0, 0.06])
+
+
+@jumping
+async def test_complaints_are_bounded() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.1, b"N")]
+    error = await refused(robots.hexa("garra", 45))
+    assert (error.code, str(error)) == ("no_answer", "BRACO did not understand garra after 3 tries")
+    assert len(robots.sent) == 3
+
+
+@jumping
+async def test_silence_after_a_complaint_is_still_an_unknown_outcome() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.1, b"N")] if len(robots.sent) == 1 else ()
+    assert (await refused(robots.hexa("garra", 45))).code == "outcome_unknown"
+    assert len(robots.sent) == 2
+
+
+@jumping
+async def test_a_complaint_elsewhere_repeats_nothing() -> None:
+    robots = Robots()
+    task = asyncio.ensure_future(robots.ascii("parafrente", 100, link="wifi", peer=("127.0.0.1", 9001)))
+    await asyncio.sleep(0.01)
+    robots.conversations.complained("radio")
+    robots.conversations.complained("wifi", ("127.0.0.1", 9002))
+    assert (await refused(task)).code == "outcome_unknown"
+    assert len(robots.sent) == 1
+
+
+@jumping
+async def test_a_complaint_that_may_be_of_either_robot_moves_neither_twice() -> None:
+    robots = Robots()
+    other = Address.named("OUTRO")
+    third = Address.named("TERCEIRO")
+    tasks = [
+        asyncio.ensure_future(robots.ascii("parafrente", 100)),
+        asyncio.ensure_future(robots.ascii("parafrente", 50, address=other)),
+        asyncio.ensure_future(robots.ascii("quantoscomandos", address=third, timeout_s=1)),
+    ]
+    await asyncio.sleep(0.01)
+    robots.conversations.complained("radio")
+    await asyncio.gather(*tasks, return_exceptions=True)
+    payloads = [payload for _, payload in robots.sent]
+    assert payloads.count(b"parafrente 100") == payloads.count(b"parafrente 50") == 1
+    assert payloads.count(b"quantoscomandos") == 2
+
+
+@jumping
+async def test_a_busy_robot_is_polled_until_free_and_then_told_again() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    answers = iter([b"B", b"B", b"F", b"A"])
+    robots.script = lambda _: [(0.1, next(answers))]
+    assert (await robots.hexa("garra", 90)).status == "sucesso"
+    assert [payload for _, payload in robots.sent] == [b"\x04\x7f", b"?", b"?", b"\x04\x7f"]
+    assert [at for at, _ in robots.sent] == pytest.approx([0, 0.6, 1.1, 1.2])
+
+
+@jumping
+async def test_a_robot_that_says_busy_for_ever_is_reported_busy_at_the_deadline() -> None:
+    robots = Robots(busy_poll_s=0.5)
+
+    def trickle() -> None:
+        robots.say(psiu_hexa.packet(ARM, OURS, b"B"))
+        asyncio.get_running_loop().call_later(0.013, trickle)
+
+    trickle()
+    error = await refused(robots.hexa("garra", 90))
+    assert (error.code, str(error)) == ("busy", "BRACO is busy and did not do garra")
+    assert now() - robots.begun == pytest.approx(6, abs=0.02)
+    payloads = [payload for _, payload in robots.sent]
+    assert payloads.count(b"\x04\x7f") == 1
+    assert 10 <= payloads.count(b"?") <= 12
+    assert robots.idle
+
+
+@jumping
+async def test_a_robot_that_says_free_for_ever_cannot_hold_a_call() -> None:
+    robots = Robots()
+
+    def trickle() -> None:
+        robots.say(psiu_hexa.packet(ARM, OURS, b"F"))
+        asyncio.get_running_loop().call_later(0.013, trickle)
+
+    trickle()
+    assert (await refused(robots.hexa("garra", 90))).code == "outcome_unknown"
+    assert now() - robots.begun == pytest.approx(2, abs=0.02)
+
+
+@jumping
+async def test_a_robot_between_busy_and_free_for_ever_ends_at_the_deadline_without_a_storm() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    robots.script = lambda frame: [(0.0, b"F" if frame.payload == b"?" else b"B")]
+    assert (await refused(robots.hexa("garra", 90))).code == "busy"
+    assert now() - robots.begun == pytest.approx(6)
+    assert len(robots.sent) <= 26
+
+
+@jumping
+async def test_a_busy_robot_that_does_not_know_avail_is_busy() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    robots.script = lambda frame: [(0.1, b"W" if frame.payload == b"?" else b"B")]
+    assert (await refused(robots.hexa("garra", 90))).code == "busy"
+    assert now() - robots.begun == pytest.approx(0.7)
+
+
+@jumping
+async def test_what_a_robot_cannot_do_is_reported_impossible() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.1, b"W")]
+    error = await refused(robots.hexa("garra", 90))
+    assert (error.code, str(error)) == ("impossible", "BRACO says that garra is impossible")
+
+
+@jumping
+async def test_a_link_that_goes_down_ends_its_calls_and_no_others() -> None:
+    robots = Robots()
+    lost = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    kept = asyncio.ensure_future(robots.hexa("garra", 1))
+    await asyncio.sleep(0.1)
+    robots.conversations.link_down("radio", "unplugged")
+    error = await refused(lost)
+    assert error.code == "link_down"
+    assert str(error).startswith("link radio is down since ")
+    assert "(unplugged), before MNERIM answered; whether it was done is unknown" in str(error)
+    assert not kept.done()
+    robots.say(psiu_hexa.packet(ARM, OURS, b"A"))
+    assert (await kept).status == "sucesso"
+
+
+@jumping
+async def test_closing_ends_every_call_and_refuses_new_ones() -> None:
+    robots = Robots()
+    calls = [asyncio.ensure_future(robots.ascii("parafrente", number)) for number in range(3)]
+    await asyncio.sleep(0.1)
+    robots.conversations.close()
+    closed_at = now()
+    assert {(await refused(call)).code for call in calls} == {"shutting_down"}
+    assert (await refused(robots.ascii("qualseunome"))).code == "shutting_down"
+    assert now() == closed_at
+    assert len(robots.sent) == 1
+    assert robots.idle
+
+
+@jumping
+async def test_one_request_is_under_way_per_robot_and_turns_come_in_order() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.5, b"parafrente sucesso")]
+    await asyncio.gather(*(robots.ascii("parafrente", number) for number in range(4)))
+    assert [payload for _, payload in robots.sent] == [b"parafrente %d" % number for number in range(4)]
+    assert [at for at, _ in robots.sent] == pytest.approx([0, 0.5, 1.0, 1.5])
+    assert robots.idle
+
+
+@jumping
+async def test_a_newcomer_does_not_overtake_who_waits() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.5, b"parafrente sucesso")]
+    order: list[int] = []
+
+    async def one(number: int) -> None:
+        await robots.ascii("parafrente", number)
+        order.append(number)
+        if number == 0:
+            await one(9)
+
+    await asyncio.gather(one(0), one(1), one(2))
+    assert order == [0, 1, 2, 9]
+
+
+@jumping
+async def test_robots_do_not_wait_for_each_other() -> None:
+    robots = Robots()
+    robots.script = lambda frame: [(0.5, b"parafrente sucesso")]
+    await asyncio.gather(*(robots.ascii("parafrente", 1, address=Address.named(f"R{n}")) for n in range(20)))
+    assert now() - robots.begun == pytest.approx(0.5)
+
+
+@jumping
+async def test_a_caller_whose_turn_does_not_come_is_told_that_nothing_was_sent() -> None:
+    robots = Robots()
+    first = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0)
+    error = await refused(robots.ascii("paratras", 5, timeout_s=1))
+    assert (error.code, str(error)) == ("expired", "MNERIM was at other calls for 1 s; paratras was not sent")
+    assert now() - robots.begun == pytest.approx(1)
+    await refused(first)
+    assert robots.sent == [(0.0, b"parafrente 100")]
+    assert robots.idle
+
+
+@jumping
+async def test_waiting_counts_against_the_deadline() -> None:
+    robots = Robots()
+    robots.script = lambda frame: [(1.5, b"parafrente sucesso")] if frame.payload == b"parafrente 1" else ()
+    first = asyncio.ensure_future(robots.ascii("parafrente", 1))
+    await asyncio.sleep(0)
+    assert (await refused(robots.ascii("quantoscomandos", timeout_s=2))).code == "no_answer"
+    assert now() - robots.begun == pytest.approx(2)
+    await first
+
+
+@jumping
+async def test_a_caller_that_gives_up_leaves_the_queue() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(0.5, b"parafrente sucesso")]
+    calls = [asyncio.ensure_future(robots.ascii("parafrente", number)) for number in range(3)]
+    await asyncio.sleep(0.1)
+    calls[1].cancel()
+    await asyncio.wait(calls)
+    assert [payload for _, payload in robots.sent] == [b"parafrente 0", b"parafrente 2"]
+    assert robots.idle
+
+
+@jumping
+async def test_a_caller_that_gives_up_in_the_middle_makes_room() -> None:
+    robots = Robots()
+    first = asyncio.ensure_future(robots.ascii("parafrente", 1))
+    second = asyncio.ensure_future(robots.ascii("parafrente", 2))
+    await asyncio.sleep(0.1)
+    first.cancel()
+    await asyncio.sleep(0)
+    robots.script = lambda _: [(0.1, b"parafrente sucesso")]
+    assert (await second).status == "sucesso"
+    assert first.cancelled()
+    assert robots.idle
+
+
+@jumping
+async def test_a_queue_in_front_of_a_robot_is_bounded() -> None:
+    robots = Robots()
+    calls = [asyncio.ensure_future(robots.ascii("parafrente", 1, timeout_s=3)) for _ in range(WAITING_KEPT + 3)]
+    outcomes = await asyncio.gather(*calls, return_exceptions=True)
+    codes = [error.code for error in outcomes if isinstance(error, CallError)]
+    assert codes.count("busy") == 2
+    assert codes.count("expired") == WAITING_KEPT
+    assert robots.idle
+
+
+@jumping
+async def test_every_call_returns_within_its_deadline_under_contention() -> None:
+    robots = Robots()
+
+    async def timed(number: int) -> float:
+        await refused(robots.ascii("parafrente", number, timeout_s=0.1 * (1 + number % 5)))
+        return now() - robots.begun - 0.1 * (1 + number % 5)
+
+    late = await asyncio.gather(*(timed(number) for number in range(40)))
+    assert max(late) < 0.001
+    assert robots.idle
+
+
+@jumping
+async def test_only_the_robot_asked_can_answer_and_only_to_us() -> None:
+    robots = Robots()
+    task = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0.1)
+    good = Frame(MNERIM, BASE, "parafrente", b"parafrente sucesso", "psiu-ascii")
+    assert not robots.say(good._replace(source=Address.named("OUTRO")))
+    assert not robots.say(good._replace(destination=Address.named("PC")))
+    assert not robots.say(good._replace(payload=b"paratras sucesso"))
+    assert robots.say(good)
+    await task
+    assert not robots.say(good)
+
+
+@jumping
+async def test_a_talkative_robot_cannot_push_out_its_own_answer_or_fill_memory() -> None:
+    robots = Robots()
+    task = asyncio.ensure_future(robots.hexa("garra", 1))
+    await asyncio.sleep(0.1)
+    robots.say(psiu_hexa.packet(ARM, OURS, b"A"))
+    for _ in range(1000):
+        robots.say(psiu_hexa.packet(ARM, OURS, b"B"))
+    assert len(robots.conversations._under_way[ARM].heard) < 10
+    assert (await task).status == "sucesso"
+
+
+@jumping
+async def test_a_ping_of_ours_is_known_while_it_waits_and_while_late_answers_may_come() -> None:
+    robots = Robots()
+    assert not robots.conversations.pinging(ARM)
+    task = asyncio.ensure_future(robots.hexa("ping"))
+    await asyncio.sleep(0.1)
+    assert robots.conversations.pinging(ARM)
+    assert (await refused(task)).code == "no_answer"
+    assert robots.conversations.pinging(ARM)
+    await asyncio.sleep(2.1)
+    assert not robots.conversations.pinging(ARM)
+    robots.script = lambda _: [(0.1, b"")]
+    assert (await robots.hexa("ping")).status == "sucesso"
+    assert not robots.conversations.pinging(ARM)
+    assert not robots.conversations._late_pings
+
+
+@jumping
+async def test_hearing_costs_one_look_when_no_call_is_under_way() -> None:
+    conversations = Conversations(lambda frame, age_s: None)
+    assert not conversations.heard(None, 0.0)  # type: ignore[arg-type]
