@@ -1,0 +1,109 @@
+"""What no single table shows: combinations that cannot work, and some that can but are risky."""
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from ipaddress import ip_address
+from typing import Final
+
+from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.config.problems import Key, Problems, got
+from psiu_broker.config.tables import (
+    ENDPOINT,
+    BrokerConfiguration,
+    LinkConfiguration,
+    RobotConfiguration,
+    ZenohConfiguration,
+)
+from psiu_broker.frame import Address
+from psiu_broker.profiles.hexa import RESERVED, Node
+
+_WORD: Final = re.compile(r"[!-~]+")
+_NUMBERED_TTY: Final = re.compile(r"/dev/tty(USB|ACM)[0-9]+")
+_EVERY_INTERFACE: Final = frozenset({"0.0.0.0", "[::]"})  # noqa: S104 (compared, not bound)
+
+
+def check_nodes(nodes: Mapping[str, Node], key: Key, problems: Problems) -> None:
+    """A node has one name, which is a word that can be sent as a command."""
+    names: dict[int, str] = {}
+    for name, node in nodes.items():
+        at = (*key, "nodes", name)
+        if not _WORD.fullmatch(name) or name in RESERVED:
+            problems.add(at, f"expected one word, none of {', '.join(sorted(RESERVED))}; call the node something else")
+        if (first := names.setdefault(node.node, name)) != name:
+            problems.add((*at, "node"), f"node {node.node} is {first} already; give it one name")
+
+
+def check_devices(links: Iterable[LinkConfiguration], problems: Problems) -> None:
+    """A serial port, a UDP port or a robot's Bluetooth address belongs to one link."""
+    held: list[tuple[str, str, str]] = []
+    for link in links:
+        for option in ("device", "address", "listen"):
+            mine = getattr(link.adapter, option, None)
+            if not isinstance(mine, str) or getattr(link.adapter, "reuse", False):
+                continue
+            for other, theirs, holder in held:
+                if option == other and _same(option, mine, theirs):
+                    text = f"{got(mine)} is taken by link {holder} already; give each link its own"
+                    problems.add(("links", link.name, option), text)
+            held.append((option, mine, link.name))
+
+
+def _same(option: str, a: str, b: str) -> bool:
+    if option == "device" and a.startswith("/") and b.startswith("/"):
+        return os.path.realpath(a) == os.path.realpath(b)
+    if option == "listen":
+        (host_a, _, port_a), (host_b, _, port_b) = a.rpartition(":"), b.rpartition(":")
+        return port_a == port_b != "0" and (host_a == host_b or not _EVERY_INTERFACE.isdisjoint((host_a, host_b)))
+    return a == b
+
+
+def check_identities(
+    broker: BrokerConfiguration | None,
+    links: Iterable[LinkConfiguration],
+    robots: Iterable[RobotConfiguration],
+    problems: Problems,
+) -> None:
+    """No two robots, the broker among them, have one name, or one address in one domain."""
+    holders: dict[Address, str] = {}
+    for link in links:
+        if isinstance(link.codec, PsiuHexa.Options):
+            holders[Address.numbered(link.codec.local, link.codec.domain)] = "the broker itself"
+    for robot in robots:
+        if broker and robot.name == broker.name:
+            problems.add(("robots", robot.name), "this is the broker's own name; rename one of them")
+        if robot.address is not None and (first := holders.setdefault(robot.address, robot.name)) != robot.name:
+            problems.add(
+                ("robots", robot.name, "address"),
+                f"{robot.address} is the address of {first} already;"
+                " give it another address, or its link a domain of its own",
+            )
+
+
+def warnings_about(file: str, zenoh: ZenohConfiguration, links: Iterable[LinkConfiguration]) -> tuple[str, ...]:
+    warnings = Problems(file)
+    for position, endpoint in enumerate(zenoh.listen):
+        if not _is_loopback(endpoint):
+            warnings.add(
+                ("zenoh", "listen", position),
+                f"{endpoint} lets every computer that reaches it move the robots; tcp/127.0.0.1:7447 does not",
+            )
+    for link in links:
+        device = getattr(link.adapter, "device", None)
+        if isinstance(device, str) and _NUMBERED_TTY.fullmatch(device):
+            warnings.add(
+                ("links", link.name, "device"),
+                f"{device} may be another device after the next plug-in; use its name under /dev/serial/by-id/",
+            )
+    return tuple(warnings.lines)
+
+
+def _is_loopback(endpoint: str) -> bool:
+    match = ENDPOINT.fullmatch(endpoint)
+    host = match["host"] if match else None
+    if host is None or host == "localhost":
+        return True
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

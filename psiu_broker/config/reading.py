@@ -1,0 +1,223 @@
+"""How the file is read. A link is one flat table for its author; its keys belong to its adapter, to its
+protocol's codec and to the link itself, and are split among those three here.
+"""
+
+import re
+import tomllib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from psiu_broker.adapter import Adapter, Peer
+from psiu_broker.codecs import CODECS
+from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.config.checks import check_devices, check_identities, check_nodes, warnings_about
+from psiu_broker.config.problems import Key, Problems, got, guess, suggestion
+from psiu_broker.config.tables import (
+    LINK_NAME,
+    BrokerConfiguration,
+    Configuration,
+    LinkConfiguration,
+    LinkOptions,
+    RobotConfiguration,
+    RobotTable,
+    ZenohConfiguration,
+    robot_name,
+)
+from psiu_broker.errors import ConfigurationError
+from psiu_broker.frame import Address
+from psiu_broker.registry import UnknownAdapter, adapter_class, adapter_names
+
+
+def load(path: Path) -> Configuration:
+    """Read the configuration in `path`.
+
+    Raises:
+        ConfigurationError: it cannot be read, or has mistakes: all of them, a line each.
+    """
+    problems = Problems(str(path))
+    try:
+        configuration = _configuration(_document(path), str(path), problems)
+    except RecursionError as error:
+        raise ConfigurationError([f"{path}: tables or lists nested too deeply; no option needs that"]) from error
+    if configuration is None:
+        raise ConfigurationError(problems.lines)
+    return configuration
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        reason = f"cannot be read: {error.strerror}; check the path, and that this user may read it"
+        raise ConfigurationError([f"{path}: {reason}"]) from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError([f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8 text"]) from error
+    except ValueError as error:
+        raise ConfigurationError([_syntax(path, str(error))]) from error
+
+
+def _syntax(path: Path, message: str) -> str:
+    """tomllib's complaint as FILE:LINE:COLUMN."""
+    match = re.fullmatch(r"(?P<what>.*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)", message)
+    if match is None:
+        return f"{path}: not TOML: {message}"
+    what = match["what"]
+    hint = "; text is written in quotes" if what == "Invalid value" else ""
+    place = f":{match['line']}:{match['column']}" if match["line"] else ": at the end"
+    return f"{path}{place}: not TOML: {what}{hint}"
+
+
+def _configuration(document: dict[str, Any], file: str, problems: Problems) -> Configuration | None:
+    """What the file says; None where it is wrong, with every mistake noted."""
+    sections = ("broker", "zenoh", "links", "robots")
+    for name in document:
+        if name not in sections:
+            problems.unknown((name,), sections)
+    broker = problems.read(BrokerConfiguration, document.get("broker", {}), ("broker",))
+    zenoh = problems.read(ZenohConfiguration, document.get("zenoh", {}), ("zenoh",))
+    own_address = broker.address if broker else 0
+    robots_written = problems.table(document.get("robots", {}), ("robots",)) or {}
+    links_written = problems.table(document.get("links", {}), ("links",)) or {}
+    links = {name: _link(name, value, robots_written, own_address, problems) for name, value in links_written.items()}
+    robots = {name: _robot(name, value, links, problems) for name, value in robots_written.items()}
+    whole_links = {name: link for name, link in links.items() if link}
+    whole_robots = {name: robot for name, robot in robots.items() if robot}
+    check_devices(whole_links.values(), problems)
+    check_identities(broker, whole_links.values(), whole_robots.values(), problems)
+    if broker is None or zenoh is None or problems.lines:
+        return None
+    return Configuration(broker, zenoh, whole_links, whole_robots, warnings_about(file, zenoh, whole_links.values()))
+
+
+def _link(
+    name: str, value: object, robots: Mapping[str, object], own_address: int, problems: Problems
+) -> LinkConfiguration | None:
+    key: Key = ("links", name)
+    before = len(problems.lines)
+    table = problems.table(value, key)
+    if table is None:
+        return None
+    if not LINK_NAME.fullmatch(name):
+        problems.add(key, "expected a name of letters, digits, - and _; rename the link")
+    adapter_name = _choice(table, key, "adapter", adapter_names(), problems)
+    protocol = _choice(table, key, "protocol", CODECS, problems)
+    adapter_model: type[Adapter] | None = None
+    if adapter_name:
+        try:
+            adapter_model = adapter_class(adapter_name)
+        except UnknownAdapter as error:
+            problems.add((*key, "adapter"), str(error))
+    codec_model = CODECS[protocol].Options if protocol else None
+    options = problems.read(LinkOptions, _share(table, LinkOptions), key)
+    adapter = problems.read(adapter_model, _share(table, adapter_model), key) if adapter_model else None
+    codec = None
+    if codec_model:
+        mine = _share(table, codec_model)
+        if codec_model is PsiuHexa.Options:
+            mine = _with_ends(name, mine, robots, own_address, problems)
+        codec = problems.read(codec_model, mine, key)
+    if adapter_model and codec_model:
+        models: tuple[type[BaseModel], ...] = (adapter_model, codec_model, LinkOptions)
+        known = {"adapter", "protocol"}.union(*(model.model_fields for model in models))
+        for word in table:
+            if word not in known:
+                problems.unknown((*key, word), known)
+    if len(problems.lines) > before or not (adapter_name and adapter and protocol and codec and options):
+        return None
+    return LinkConfiguration(name, adapter_name, adapter, protocol, codec, options)
+
+
+def _choice(table: dict[str, Any], key: Key, word: str, known: Collection[str], problems: Problems) -> str | None:
+    """The value of `word`, which must be one of `known`."""
+    value = table.get(word)
+    if isinstance(value, str) and value in known:
+        return value
+    choices = ", ".join(sorted(known))
+    if word not in table:
+        problems.add((*key, word), f"missing; write {word} = … with one of {choices}")
+    else:
+        question = guess(str(value), known)
+        problems.add(
+            (*key, word), f"expected one of {choices}, got {got(value)}" + (f"; {question}" if question else "")
+        )
+    return None
+
+
+def _share(table: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    return {word: value for word, value in table.items() if word in model.model_fields}
+
+
+def _with_ends(
+    link: str, codec: dict[str, Any], robots: Mapping[str, object], own_address: int, problems: Problems
+) -> dict[str, Any]:
+    """The codec's keys, with the addresses that packets of its topology leave out taken from the rest of the file."""
+    codec = {"local": own_address} | codec
+    if codec.get("topology") != "point-to-point":
+        if "remote" in codec:
+            problems.add(("links", link, "remote"), 'is for topology = "point-to-point"; remove it')
+        return codec
+    tables = {name: robot for name, robot in robots.items() if isinstance(robot, dict)}
+    here = {name: robot.get("address") for name, robot in tables.items() if robot.get("link") == link}
+    addresses = {name: address for name, address in here.items() if type(address) is int}
+    key: Key = ("links", link, "topology")
+    if len(here) > 1:
+        problems.add(key, f"one robot is at the far end of a point-to-point link, got {', '.join(here)}; keep one")
+    for name, address in addresses.items():
+        if codec.setdefault("remote", address) != address:
+            problems.add(
+                ("robots", name, "address"),
+                f"expected {got(codec['remote'])}, the remote of link {link}, got {got(address)}; remove one of them",
+            )
+    if not here and "remote" not in codec:
+        problems.add(key, f'point-to-point packets name no robot; add [robots.NAME] with address and link = "{link}"')
+    return codec
+
+
+def _robot(
+    name: str, value: object, links: Mapping[str, LinkConfiguration | None], problems: Problems
+) -> RobotConfiguration | None:
+    key: Key = ("robots", name)
+    table = problems.table(value, key)
+    if table is None:
+        return None
+    try:
+        robot_name(name)
+    except ValueError as error:
+        problems.add(key, str(error))
+    at = table.get("link")
+    if isinstance(at, str) and at not in links:
+        problems.add((*key, "link"), f"there is no link {got(at)}; {suggestion(at, links) if links else 'add one'}")
+    robot = problems.read(RobotTable, table, key)
+    link = links.get(robot.link) if robot else None
+    if robot is None or link is None:
+        return None
+    address = None
+    if isinstance(link.codec, PsiuHexa.Options):
+        if robot.address is None:
+            problems.add(
+                (*key, "address"), f"missing; link {link.name} speaks psiu-hexa, whose robots are numbers 0–255"
+            )
+            return None
+        address = Address.numbered(robot.address, link.codec.domain)
+        check_nodes(robot.nodes, key, problems)
+    else:
+        for word in ("address", "nodes", "sensor_reply"):
+            if word in table:
+                problems.add((*key, word), f"is for psiu-hexa, and link {link.name} speaks {link.protocol}; remove it")
+    peer: Peer = robot.peer
+    if robot.peer is not None and link.adapter.datagrams:
+        peer = _host_and_port(robot.peer)
+        if peer is None:
+            text = f'expected "HOST:PORT", got {got(robot.peer)}; write it like "192.168.1.20:9001"'
+            problems.add((*key, "peer"), text)
+    return RobotConfiguration(name, robot.link, link.protocol, address, peer, robot.nodes, robot.sensor_reply)
+
+
+def _host_and_port(text: str) -> tuple[str, int] | None:
+    match = re.fullmatch(r"(?:\[(?P<v6>[0-9A-Fa-f:.%\w]+)\]|(?P<host>[^\s:\[\]]+)):(?P<port>[0-9]{1,5})", text)
+    if match is None or not 0 < int(match["port"]) <= 65535:
+        return None
+    return match["v6"] or match["host"], int(match["port"])

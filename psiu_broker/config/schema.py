@@ -1,0 +1,55 @@
+"""The JSON schema of the file, for editors that complete and check while one types."""
+
+from typing import Any
+
+from pydantic import BaseModel
+
+from psiu_broker.codecs import CODECS
+from psiu_broker.config.tables import LINK_NAME, BrokerConfiguration, LinkOptions, RobotTable, ZenohConfiguration
+from psiu_broker.registry import adapter_class, adapter_names
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema (2020-12) of the file, with the options of every adapter and protocol, for editors."""
+    definitions: dict[str, Any] = {}
+
+    def schema(model: type[BaseModel]) -> dict[str, Any]:
+        made = model.model_json_schema()
+        definitions.update(made.pop("$defs", {}))
+        return made
+
+    def only_if(word: str, name: str, model: type[BaseModel]) -> dict[str, Any]:
+        made = schema(model)
+        then = {"properties": made.get("properties", {}), "required": made.get("required", [])}
+        return {"if": {"properties": {word: {"const": name}}, "required": [word]}, "then": then}
+
+    link: dict[str, Any] = {
+        "type": "object",
+        "properties": {
+            "adapter": {"enum": adapter_names(), "description": "how the link is reached"},
+            "protocol": {"enum": sorted(CODECS), "description": "what its robots speak"},
+            **schema(LinkOptions)["properties"],
+        },
+        "required": ["adapter", "protocol"],
+        "allOf": [only_if("adapter", name, adapter_class(name)) for name in adapter_names()]
+        + [only_if("protocol", name, codec.Options) for name, codec in sorted(CODECS.items())],
+        "unevaluatedProperties": False,
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "psiu-broker configuration",
+        "type": "object",
+        "properties": {
+            "broker": schema(BrokerConfiguration),
+            "zenoh": schema(ZenohConfiguration),
+            "links": {
+                "type": "object",
+                "propertyNames": {"pattern": f"^{LINK_NAME.pattern}$"},
+                "additionalProperties": link,
+            },
+            "robots": {"type": "object", "additionalProperties": schema(RobotTable)},
+        },
+        "required": ["broker"],
+        "additionalProperties": False,
+        "$defs": definitions,
+    }

@@ -1,0 +1,136 @@
+"""What may be written in the file, table by table, and what is made of it."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from psiu_broker.adapter import Adapter, Peer
+from psiu_broker.config.problems import got
+from psiu_broker.frame import EVERYONE, Address
+from psiu_broker.profiles.hexa import Node
+
+
+def robot_name(name: str) -> str:
+    if not name.isascii() or not name.isprintable() or not name or name != name.strip():
+        raise ValueError(f"expected a name of printable ASCII characters, got {got(name)}; choose a plain word")
+    if str(EVERYONE) in name:
+        raise ValueError(f"expected a name, got {got(name)}; ?? asks every robot, choose another word")
+    if Address.parse(name).is_numbered:
+        raise ValueError(f"expected a name, got {got(name)}, which reads as a PSIU HEXA address; choose a word")
+    return name
+
+
+def _endpoint(endpoint: str) -> str:
+    match = ENDPOINT.fullmatch(endpoint)
+    if match is None or int(match["port"] or 0) > 65535:
+        raise ValueError(
+            f"expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH), got {got(endpoint)};"
+            " write it like tcp/127.0.0.1:7447"
+        )
+    return endpoint
+
+
+def _prefix(prefix: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", prefix):
+        raise ValueError(f"expected words of letters, digits and _.- joined by /, got {got(prefix)}; psiu is usual")
+    return prefix
+
+
+LINK_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
+ENDPOINT: Final = re.compile(
+    r"(?:tcp|udp|ws)/(?P<host>\[[^\s\[\]]+\]|[^\s:/\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?|unixsock-stream/\S+"
+)
+
+RobotName = Annotated[str, AfterValidator(robot_name)]
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Prefix = Annotated[str, AfterValidator(_prefix)]
+Number = Annotated[int, Field(ge=0, le=255)]
+SensorReply = Literal["node-0", "bit7"]
+Seconds = Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class BrokerConfiguration(_Table):
+    """``[broker]``: who the broker is to robots, whose protocols it speaks as one of them."""
+
+    name: RobotName = Field(description="the broker's own name among the robots")
+    address: Number = Field(0, description="the broker's own PSIU HEXA address")
+
+
+class ZenohConfiguration(_Table):
+    """``[zenoh]``: where other programs find the broker."""
+
+    listen: tuple[Endpoint, ...] = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
+    connect: tuple[Endpoint, ...] = Field((), description="other brokers to connect to")
+    prefix: Prefix = Field("psiu", description="the first part of every key")
+
+
+class LinkOptions(_Table):
+    """What may be written in every ``[links.NAME]``, whatever its adapter and protocol."""
+
+    queue_frames: int = Field(64, ge=1, le=100_000, description="frames that may wait to be sent")
+    max_age_s: Seconds = Field(2.0, description="a frame that waited longer is dropped: nothing late moves a robot")
+    route_age_s: Seconds = Field(300.0, description="a robot not heard for so long is forgotten")
+    timeout_s: Seconds = Field(2.0, description="how long a robot may take to answer, one try")
+    retries: int = Field(2, ge=0, le=100, description="how often a question is asked again after silence")
+    busy_poll_s: Seconds = Field(0.1, description="PSIU HEXA: how often a busy robot is asked AVAIL?")
+    nak: bool | None = Field(None, description="PSIU HEXA: answer a bad CRC with NAK; left out: as the topology asks")
+    avr_limits: bool = Field(False, description="the robots have an AVR's small buffers: warn before exceeding them")
+    wildcard: bool = Field(True, description="frames to ?? are sent on this link")
+    greet: bool = Field(True, description="ask who is there when the link opens")
+
+
+class RobotTable(_Table):
+    """``[robots.NAME]`` as it is written."""
+
+    link: str = Field(description="the name of its link")
+    address: Number | None = Field(None, description="its PSIU HEXA address")
+    peer: str | None = Field(None, description='where it is on its link; "host:port" over UDP')
+    nodes: dict[str, Node] = Field({}, description="PSIU HEXA: names for its nodes")
+    sensor_reply: SensorReply = Field(
+        "node-0", description="PSIU HEXA: how its sensors answer, as node 0, or as themselves with bit 7 set"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfiguration:
+    """One link: how it is opened, what is spoken on it, and how it is kept."""
+
+    name: str
+    adapter_name: str
+    adapter: Adapter
+    protocol: str
+    codec: BaseModel
+    """The `Options` of ``CODECS[protocol]``."""
+    options: LinkOptions
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfiguration:
+    """A robot that the user named: its link, its PSIU HEXA address where it has one, and its nodes."""
+
+    name: str
+    link: str
+    protocol: str
+    address: Address | None
+    peer: Peer
+    """As the link's adapter knows it, ``(host, port)`` over UDP; None where the file leaves it out."""
+    nodes: Mapping[str, Node]
+    sensor_reply: SensorReply
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """A whole configuration that can work; `warnings` are lines for the user about what is allowed but risky."""
+
+    broker: BrokerConfiguration
+    zenoh: ZenohConfiguration
+    links: Mapping[str, LinkConfiguration]
+    robots: Mapping[str, RobotConfiguration]
+    warnings: tuple[str, ...] = ()

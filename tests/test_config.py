@@ -1,0 +1,570 @@
+import json
+import tomllib
+from pathlib import Path
+from textwrap import dedent
+
+import jsonschema
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from psiu_broker.config import Configuration, json_schema, load, reading
+from psiu_broker.errors import ConfigurationError
+from psiu_broker.frame import Address
+from psiu_broker.registry import UnknownAdapter
+
+EXAMPLE = Path(__file__).parents[1] / "deploy/examples/psiu-broker.toml"
+
+AS_IN_THE_README = """
+    [broker]
+    name = "base"
+    [zenoh]
+    listen = ["tcp/127.0.0.1:7447"]
+    [links.radio]
+    adapter = "serial"
+    device = "/dev/serial/by-id/usb-FTDI_FT232R-if00-port0"
+    baudrate = 9600
+    protocol = "psiu-ascii"
+    [links.wifi]
+    adapter = "udp"
+    listen = "127.0.0.1:9000"
+    peers = ["127.0.0.1:9001"]
+    protocol = "psiu-ascii"
+    [links.arm]
+    adapter = "rfcomm"
+    address = "98:D3:31:00:00:01"
+    protocol = "psiu-hexa"
+    topology = "point-to-point"
+    [robots.BRACO]
+    address = 0x12
+    link = "arm"
+    nodes.garra = { node = 4, type = "servo" }
+"""
+
+BROKER = """
+    [broker]
+    name = "base"
+"""
+RADIO = """
+    [links.radio]
+    adapter = "serial"
+    device = "/dev/serial/by-id/radio"
+    protocol = "psiu-ascii"
+"""
+HEXA = """
+    [links.hexa]
+    adapter = "serial"
+    device = "/dev/serial/by-id/hexa"
+    protocol = "psiu-hexa"
+"""
+ARM = HEXA.replace("links.hexa", "links.arm").replace("by-id/hexa", "by-id/arm") + 'topology = "point-to-point"\n'
+WIFI = """
+    [links.wifi]
+    adapter = "udp"
+    listen = "127.0.0.1:9000"
+    protocol = "psiu-ascii"
+"""
+
+
+@pytest.fixture
+def read(tmp_path, monkeypatch):
+    """Loads text as radio.toml, which lies in the current folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def read(text: str) -> Configuration:
+        Path("radio.toml").write_text(dedent(text), encoding="utf-8")
+        return load(Path("radio.toml"))
+
+    return read
+
+
+@pytest.fixture
+def problems(read):
+    """What is said about text, a line each, without the file's name that begins every line."""
+
+    def problems(text: str) -> list[str]:
+        with pytest.raises(ConfigurationError) as caught:
+            read(text)
+        assert all(line.startswith("radio.toml:") for line in caught.value.problems)
+        return [line.removeprefix("radio.toml: ") for line in caught.value.problems]
+
+    return problems
+
+
+def test_the_configuration_of_the_readme_loads_as_written(read):
+    configuration = read(AS_IN_THE_README)
+    assert configuration.broker.name == "base"
+    assert configuration.broker.address == 0
+    assert configuration.zenoh.listen == ("tcp/127.0.0.1:7447",)
+    assert configuration.zenoh.connect == ()
+    assert configuration.zenoh.prefix == "psiu"
+    assert configuration.warnings == ()
+    radio, wifi, arm = configuration.links.values()
+    assert (radio.name, radio.adapter_name, radio.protocol) == ("radio", "serial", "psiu-ascii")
+    assert radio.adapter.model_dump()["baudrate"] == 9600
+    assert wifi.adapter.model_dump()["peers"] == ("127.0.0.1:9001",)
+    assert arm.adapter.model_dump()["address"] == "98:D3:31:00:00:01"
+    assert (arm.options.queue_frames, arm.options.max_age_s, arm.options.nak) == (64, 2.0, None)
+    robot = configuration.robots["BRACO"]
+    assert (robot.name, robot.link, robot.protocol) == ("BRACO", "arm", "psiu-hexa")
+    assert robot.address == Address.numbered(0x12)
+    assert (robot.nodes["garra"].node, robot.nodes["garra"].type) == (4, "servo")
+
+
+def test_a_point_to_point_link_takes_its_ends_from_its_robot_and_the_broker(read):
+    codec = read(AS_IN_THE_README.replace('name = "base"', 'name = "base"\naddress = 7')).links["arm"].codec
+    assert codec.model_dump()["remote"] == 0x12
+    assert codec.model_dump()["local"] == 7
+
+
+def test_the_keys_of_a_link_are_split_among_adapter_codec_and_link(read):
+    link = read(BROKER + HEXA + 'baudrate = 115200\ncrc = "xor"\ndomain = "red"\nmax_age_s = 1\nlocal = 9\n').links[
+        "hexa"
+    ]
+    assert link.adapter.model_dump()["baudrate"] == 115200
+    assert link.codec.model_dump() | {"crc": "xor", "domain": "red", "local": 9} == link.codec.model_dump()
+    assert link.options.max_age_s == 1.0
+
+
+def test_a_robot_s_address_is_in_the_domain_of_its_link(read):
+    robot = read(BROKER + HEXA + 'domain = "red"\n[robots.UM]\nlink = "hexa"\naddress = 3\n').robots["UM"]
+    assert robot.address == Address.numbered(3, "red")
+
+
+def test_a_udp_robot_s_peer_is_what_the_adapter_calls_it(read):
+    robot = read(BROKER + WIFI + '[robots.MNERIM]\nlink = "wifi"\npeer = "127.0.0.1:9001"\n').robots["MNERIM"]
+    assert robot.peer == ("127.0.0.1", 9001)
+
+
+def test_a_broker_without_links_is_allowed(read):
+    assert read(BROKER).links == {}
+
+
+def test_a_configuration_cannot_be_changed(read):
+    configuration = read(AS_IN_THE_README)
+    for thing, field in [
+        (configuration, "broker"),
+        (configuration.broker, "name"),
+        (configuration.links["radio"], "name"),
+        (configuration.links["radio"].options, "retries"),
+        (configuration.robots["BRACO"], "link"),
+    ]:
+        with pytest.raises((AttributeError, ValueError)):
+            setattr(thing, field, "other")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        pytest.param(
+            BROKER + RADIO + "baudrat = 9600", "links.radio.baudrat: unknown key; did you mean baudrate?", id="link"
+        ),
+        pytest.param(
+            BROKER + RADIO + "strct = true", "links.radio.strct: unknown key; did you mean strict?", id="codec"
+        ),
+        pytest.param(
+            BROKER + RADIO + "retrys = 1", "links.radio.retrys: unknown key; did you mean retries?", id="option"
+        ),
+        pytest.param(BROKER + "nme = 1", "broker.nme: unknown key; did you mean name?", id="broker"),
+        pytest.param(BROKER + "[link.a]", "link: unknown key; did you mean links?", id="table"),
+        pytest.param(
+            BROKER + HEXA + '[robots.A]\nlink="hexa"\naddress=1\nnodes.g={node=1,type="dc",sgned=true}',
+            "robots.A.nodes.g.sgned: unknown key; did you mean signed?",
+            id="node",
+        ),
+        pytest.param(
+            BROKER + "[zenoh]\nxyz = 1", "zenoh.xyz: unknown key; known: connect, listen, prefix", id="nothing near"
+        ),
+        pytest.param(
+            BROKER + RADIO + "topology = 1", "links.radio.topology: unknown key; known: adapter,", id="other protocol"
+        ),
+    ],
+)
+def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, expected):
+    (line,) = problems(text)
+    assert line.startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            RADIO + 'baudrate = "9600"',
+            'links.radio.baudrate: expected a whole number, got "9600"; write it without quotes: 9600',
+        ),
+        (RADIO + "baudrate = 9600.0", "links.radio.baudrate: expected a whole number, got 9600.0"),
+        (RADIO + "baudrate = true", "links.radio.baudrate: expected a whole number, got true"),
+        (
+            RADIO + "strict = 'true'",
+            'links.radio.strict: expected true or false, got "true"; write it without quotes: true',
+        ),
+        (RADIO + "version = 1", "links.radio.version: expected '1', got 1; write it in quotes: \"1\""),
+        (RADIO + "nak = 1", "links.radio.nak: expected true or false, got 1"),
+        (RADIO + "max_age_s = 0", "links.radio.max_age_s: expected a number greater than 0, got 0"),
+        (RADIO + "max_age_s = inf", "links.radio.max_age_s: expected a finite number, got inf"),
+        (RADIO + "timeout_s = nan", "links.radio.timeout_s: expected a finite number, got nan"),
+        (
+            RADIO + 'parity = "evne"',
+            "links.radio.parity: expected 'none', 'even', 'odd', 'mark' or 'space', got \"evne\"; did you mean even?",
+        ),
+        (
+            RADIO.replace('"/dev/serial/by-id/radio"', "1979-05-27"),
+            'links.radio.device: expected text, got 1979-05-27; write it in quotes: "1979-05-27"',
+        ),
+        (
+            WIFI + 'peers = "127.0.0.1:1"',
+            'links.wifi.peers: expected a list, got "127.0.0.1:1"; write it in brackets: ["127.0.0.1:1"]',
+        ),
+        (WIFI + "peers = [9001]", 'links.wifi.peers[0]: expected text, got 9001; write it in quotes: "9001"'),
+        ('[links.radio]\nadapter="serial"\nprotocol="psiu-ascii"', "links.radio.device: missing; write device = … ("),
+        (
+            RADIO.replace('"serial"', '"seral"'),
+            'links.radio.adapter: expected one of rfcomm, serial, udp, got "seral"; did you mean serial?',
+        ),
+        (
+            RADIO.replace('adapter = "serial"', ""),
+            "links.radio.adapter: missing; write adapter = … with one of rfcomm, serial, udp",
+        ),
+        (
+            RADIO.replace('"psiu-ascii"', '"psiu-asci"'),
+            'links.radio.protocol: expected one of psiu-ascii, psiu-hexa, got "psiu-asci"; did you mean psiu-ascii?',
+        ),
+        ("[links]\nradio = 3", "links.radio: expected a table, got 3; write [links.radio] above its keys"),
+        (
+            '[zenoh]\nconnect = ["10.0.0.1:7447"]',
+            "zenoh.connect[0]: expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH),"
+            ' got "10.0.0.1:7447"; write it like tcp/127.0.0.1:7447',
+        ),
+        ('[zenoh]\nlisten = ["serial/dev/ttyUSB0:1"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),
+        ('[zenoh]\nlisten = ["tcp/[::1]:99999"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),
+        ('[zenoh]\nprefix = "psiu/**"', "zenoh.prefix: expected words of"),
+        (
+            HEXA + '[robots.A]\nlink="hexa"\naddress=256',
+            "robots.A.address: expected a number less than or equal to 255",
+        ),
+        (
+            HEXA + '[robots.A]\nlink="hexa"\naddress="0x12"',
+            'robots.A.address: expected a whole number, got "0x12"; write it without quotes: 0x12',
+        ),
+    ],
+)
+def test_a_wrong_value_is_refused_with_what_was_expected_and_what_was_got(problems, text, expected):
+    (line,) = problems(BROKER + text)
+    assert line.startswith(expected)
+
+
+@pytest.mark.parametrize("name", ["", "a??b", "0x12", "red.0x03", "José", " base", "a\\nb"])
+def test_the_broker_s_name_is_one_that_a_robot_can_have(problems, name):
+    (line,) = problems(f'[broker]\nname = "{name}"')
+    assert line.startswith("broker.name: expected a name")
+
+
+def test_a_robot_s_name_is_not_an_address(problems):
+    (line,) = problems(BROKER + HEXA + '[robots.0x12]\nlink = "hexa"\naddress = 0x12')
+    assert line.startswith('robots.0x12: expected a name, got "0x12", which reads as a PSIU HEXA address')
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        pytest.param(
+            ARM,
+            "links.arm.topology: point-to-point packets name no robot; add [robots.NAME] with address and link",
+            id="point-to-point without a robot",
+        ),
+        pytest.param(
+            ARM + '[robots.A]\nlink="arm"\naddress=1\n[robots.B]\nlink="arm"\naddress=1',
+            "links.arm.topology: one robot is at the far end of a point-to-point link, got A, B; keep one",
+            id="point-to-point with two robots",
+        ),
+        pytest.param(
+            ARM + 'remote=2\n[robots.A]\nlink="arm"\naddress=1',
+            "robots.A.address: expected 2, the remote of link arm, got 1",
+            id="point-to-point with two addresses",
+        ),
+        pytest.param(HEXA + "remote = 2", "links.hexa.remote: is for topology", id="remote without point-to-point"),
+        pytest.param(
+            RADIO + RADIO.replace("links.radio", "links.other"),
+            'links.other.device: "/dev/serial/by-id/radio" is taken by link radio already',
+            id="two links on one device",
+        ),
+        pytest.param(
+            WIFI + WIFI.replace("links.wifi", "links.lan").replace("127.0.0.1", "0.0.0.0"),
+            'links.lan.listen: "0.0.0.0:9000" is taken by link wifi already',
+            id="a UDP port twice",
+        ),
+        pytest.param(
+            HEXA + '[robots.A]\nlink="hexa"\naddress=1\n[robots.B]\nlink="hexa"\naddress=1',
+            "robots.B.address: 0x01 is the address of A already",
+            id="one address twice",
+        ),
+        pytest.param(
+            HEXA + '[robots.A]\nlink="hexa"\naddress=0',
+            "robots.A.address: 0x00 is the address of the broker itself already",
+            id="the broker's address",
+        ),
+        pytest.param(
+            RADIO + '[robots.base]\nlink="radio"', "robots.base: this is the broker's own name", id="our name"
+        ),
+        pytest.param(
+            RADIO + '[robots.A]\nlink="radoi"',
+            'robots.A.link: there is no link "radoi"; did you mean radio?',
+            id="no such link",
+        ),
+        pytest.param(
+            RADIO + '[robots.A]\nlink="radio"\nnodes.g={node=1,type="dc"}',
+            "robots.A.nodes: is for psiu-hexa, and link radio speaks psiu-ascii; remove it",
+            id="nodes in PSIU ASCII",
+        ),
+        pytest.param(
+            RADIO + '[robots.A]\nlink="radio"\naddress=1',
+            "robots.A.address: is for psiu-hexa, and link radio speaks psiu-ascii; remove it",
+            id="an address in PSIU ASCII",
+        ),
+        pytest.param(
+            HEXA + '[robots.A]\nlink="hexa"',
+            "robots.A.address: missing; link hexa speaks psiu-hexa",
+            id="no address in PSIU HEXA",
+        ),
+        pytest.param(
+            HEXA + '[robots.A]\nlink="hexa"\naddress=1\nnodes.a={node=1,type="dc"}\nnodes.b={node=1,type="dc"}',
+            "robots.A.nodes.b.node: node 1 is a already; give it one name",
+            id="one node twice",
+        ),
+        pytest.param(
+            HEXA + '[robots.A]\nlink="hexa"\naddress=1\nnodes.ping={node=1,type="dc"}',
+            "robots.A.nodes.ping: expected one word, none of",
+            id="a node called ping",
+        ),
+        pytest.param(
+            WIFI + '[robots.A]\nlink="wifi"\npeer="127.0.0.1"',
+            'robots.A.peer: expected "HOST:PORT", got "127.0.0.1"',
+            id="a peer without a port",
+        ),
+        pytest.param(
+            RADIO.replace("links.radio", 'links."my radio"'),
+            'links."my radio": expected a name of letters, digits, - and _',
+            id="a link's name",
+        ),
+    ],
+)
+def test_what_cannot_work_together_is_refused(problems, text, expected):
+    (line,) = problems(BROKER + text)
+    assert line.startswith(expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        WIFI + WIFI.replace("links.wifi", "links.lan").replace("9000", "9001"),
+        WIFI + WIFI.replace("links.wifi", "links.lan").replace("127.0.0.1", "127.0.0.2"),
+        (WIFI + WIFI.replace("links.wifi", "links.lan")).replace(":9000", ":0"),
+        HEXA + HEXA.replace("hexa]", "blue]").replace("by-id/hexa", "by-id/blue") + 'domain="blue"\n'
+        '[robots.A]\nlink="hexa"\naddress=1\n[robots.B]\nlink="blue"\naddress=1',
+    ],
+)
+def test_what_only_looks_alike_is_allowed(read, text):
+    assert len(read(BROKER + text).links) == 2
+
+
+def test_two_names_of_one_device_are_noticed(problems, tmp_path):
+    (tmp_path / "ttyUSB9").touch()
+    (tmp_path / "by-id").symlink_to("ttyUSB9")
+    one = RADIO.replace("/dev/serial/by-id/radio", str(tmp_path / "ttyUSB9"))
+    two = RADIO.replace("/dev/serial/by-id/radio", str(tmp_path / "by-id")).replace("links.radio", "links.two")
+    (line,) = problems(BROKER + one + two)
+    assert line.startswith("links.two.device: ")
+
+
+def test_every_mistake_is_told_at_once(problems):
+    lines = problems(
+        """
+        [brokr]
+        [broker]
+        name = "??"
+        [zenoh]
+        listen = [1]
+        [links.radio]
+        adapter = "serial"
+        baudrate = "9600"
+        baudrat = 1
+        protocol = "psiu-asci"
+        retries = -1
+        [links.wifi]
+        adapter = "udp"
+        listen = "127.0.0.1:9000"
+        protocol = "psiu-ascii"
+        strictt = true
+        [robots.A]
+        link = "wifii"
+        adress = 1
+        """
+    )
+    assert [line.partition(": ")[0] for line in lines] == [
+        "brokr",
+        "broker.name",
+        "zenoh.listen[0]",
+        "links.radio.protocol",
+        "links.radio.retries",
+        "links.radio.device",
+        "links.radio.baudrate",
+        "links.wifi.strictt",
+        "robots.A.link",
+        "robots.A.adress",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[links.a]\ndevice = /dev/ttyUSB0", "radio.toml:2:10: not TOML: Invalid value; text is written in quotes"),
+        ("[broker]\nname = 'a'\nname = 'b'\n", "radio.toml:3:11: not TOML: Cannot overwrite a value"),
+        ("name = ", "radio.toml: at the end: not TOML: Invalid value"),
+        ("a = " + "9" * 5000, "radio.toml: not TOML: "),
+        ("a = " + "[" * 5000 + "]" * 5000, "radio.toml: tables or lists nested too deeply"),
+        ("[broker" + ".a" * 5000 + "]", "radio.toml: tables or lists nested too deeply"),
+    ],
+)
+def test_what_is_not_toml_is_told_with_line_and_column(read, text, expected):
+    with pytest.raises(ConfigurationError) as caught:
+        read(text)
+    (line,) = caught.value.problems
+    assert line.startswith(expected)
+
+
+def test_a_file_that_cannot_be_read_is_told_in_one_line(tmp_path):
+    (tmp_path / "latin1.toml").write_bytes("name = 'José'".encode("latin-1"))
+    for name, expected in {
+        "missing.toml": "cannot be read: No such file or directory",
+        ".": "cannot be read: Is a directory",
+        "latin1.toml": "byte 11 is not UTF-8",
+    }.items():
+        with pytest.raises(ConfigurationError) as caught:
+            load(tmp_path / name)
+        (line,) = caught.value.problems
+        assert line.startswith(f"{tmp_path / name}: {expected}")
+
+
+def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(tmp_path):
+    path = tmp_path / "windows.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + dedent(AS_IN_THE_README).replace("\n", "\r\n").encode())
+    assert load(path).broker.name == "base"
+
+
+def test_an_adapter_that_cannot_be_loaded_is_told_in_one_line(problems, monkeypatch):
+    def broken(name: str) -> None:
+        raise UnknownAdapter(f"the adapter {name!r} cannot be loaded: no module")
+
+    monkeypatch.setattr(reading, "adapter_class", broken)
+    assert problems(BROKER + RADIO) == ["links.radio.adapter: the adapter 'serial' cannot be loaded: no module"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            '[zenoh]\nlisten = ["tcp/127.0.0.1:1", "tcp/0.0.0.0:7447"]',
+            "radio.toml: zenoh.listen[1]: tcp/0.0.0.0:7447 lets",
+        ),
+        ('[zenoh]\nlisten = ["tcp/[::]:7447"]', "radio.toml: zenoh.listen[0]: "),
+        ('[zenoh]\nlisten = ["tcp/robot.lan:7447"]', "radio.toml: zenoh.listen[0]: "),
+        (
+            RADIO.replace("/dev/serial/by-id/radio", "/dev/ttyUSB0"),
+            "radio.toml: links.radio.device: /dev/ttyUSB0 may be",
+        ),
+        (
+            RADIO.replace("/dev/serial/by-id/radio", "/dev/ttyACM12"),
+            "radio.toml: links.radio.device: /dev/ttyACM12 may",
+        ),
+    ],
+)
+def test_what_is_allowed_but_risky_is_warned_of(read, text, expected):
+    (warning,) = read(BROKER + text).warnings
+    assert warning.startswith(expected)
+
+
+def test_loopback_is_not_warned_of(read):
+    listen = '["tcp/127.0.0.2:0", "tcp/localhost:7447", "tcp/[::1]:7447", "unixsock-stream//run/psiu"]'
+    assert read(BROKER + f"[zenoh]\nlisten = {listen}").warnings == ()
+
+
+def test_the_schema_accepts_the_readme_s_configuration_and_refuses_what_loading_refuses():
+    schema = json_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    check = jsonschema.Draft202012Validator(json.loads(json.dumps(schema)))
+    good = tomllib.loads(dedent(AS_IN_THE_README))
+    check.validate(good)
+    check.validate(tomllib.loads(EXAMPLE.read_text()))
+    for path, value in {
+        ("links", "radio", "baudrat"): 9600,
+        ("links", "radio", "topology"): "ad-hoc",
+        ("links", "radio", "adapter"): "seral",
+        ("links", "wifi", "baudrate"): 9600,
+        ("robots", "BRACO", "nodes", "garra", "type"): "srvo",
+        ("broker", "address"): 256,
+        ("other",): 1,
+    }.items():
+        bad = json.loads(json.dumps(good))
+        table = bad
+        for part in path[:-1]:
+            table = table[part]
+        table[path[-1]] = value
+        assert not check.is_valid(bad), path
+
+
+values = st.recursive(
+    st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=20)
+    | st.sampled_from(["serial", "psiu-hexa", "radio"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=5,
+)
+KEYS = [
+    "adapter",
+    "protocol",
+    "device",
+    "baudrate",
+    "peers",
+    "listen",
+    "address",
+    "link",
+    "nodes",
+    "topology",
+    "remote",
+]
+
+
+def toml(value: object) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case str():
+            return json.dumps(value).replace("\\u007f", "\\u007F").replace("\x7f", "\\u007F")
+        case list():
+            return "[" + ", ".join(map(toml, value)) + "]"
+        case dict():
+            return "{" + ", ".join(f"{toml(key)} = {toml(inner)}" for key, inner in value.items()) + "}"
+        case _:
+            return repr(value)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.dictionaries(
+        st.sampled_from(["broker", "zenoh", "links", "robots"]),
+        values
+        | st.dictionaries(st.sampled_from(["radio", "name", "A"]), st.dictionaries(st.sampled_from(KEYS), values)),
+    )
+)
+def test_whatever_the_file_says_the_author_gets_whole_lines_and_never_a_traceback(tmp_path, tables):
+    path = tmp_path / "radio.toml"
+    path.write_text("\n".join(f"{name} = {toml(value)}" for name, value in tables.items()), encoding="utf-8")
+    try:
+        load(path)
+    except ConfigurationError as error:
+        assert error.problems
+        for line in error.problems:
+            assert line.startswith(str(path))
+            assert line.splitlines() == [line]
