@@ -1,0 +1,47 @@
+# make demo | test | bench | lint: each sets up .venv first, once. Another Python: make test PYTHON=/path/to/python3.12
+
+PYTHON ?=
+BIN := .venv/bin
+EXTRAS := test,lint,bluetooth-simulator,hotplug
+CANDIDATES := $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
+
+.PHONY: help demo test bench lint clean
+
+help:
+	@echo "make demo    a broker and three simulated robots, for a look"
+	@echo "make test    all tests"
+	@echo "make bench   the figures of the README"
+	@echo "make lint    ruff, mypy, the import rules"
+	@echo "make clean   remove what was set up"
+
+demo: .venv/.ready
+	@$(BIN)/psiu-broker demo
+
+test: .venv/.ready
+	$(BIN)/pytest $(PYTEST_ARGS)
+
+bench: .venv/.ready
+	@$(BIN)/python -m tests.bench
+
+lint: .venv/.ready
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf .venv
+
+.venv/.ready: pyproject.toml Makefile
+	@python=; for candidate in $(CANDIDATES); do \
+	    if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	    echo "psiu-broker needs Python 3.11 or newer, and none of these is: $(CANDIDATES)." >&2; \
+	    echo "Install one, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11" >&2; exit 1; \
+	fi; \
+	if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+	    echo "$$python cannot make virtual environments; on Debian: apt install python3-venv" >&2; exit 1; \
+	fi; \
+	echo "Setting up .venv with $$($$python --version): once, for a minute or two"; \
+	"$$python" -m venv .venv && $(BIN)/pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]' && touch $@

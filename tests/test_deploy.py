@@ -1,0 +1,103 @@
+"""What is installed beside the package, checked by the tools of those who read it."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from psiu_broker import __version__
+from psiu_broker.config import load
+
+TREE = Path(__file__).parents[1]
+DEPLOY = TREE / "deploy"
+SERVICE = DEPLOY / "psiu-broker.service"
+EXAMPLE = DEPLOY / "examples" / "psiu-broker.toml"
+SYSTEMD_ANALYZE = shutil.which("systemd-analyze")
+SYSTEMD_SYSUSERS = shutil.which("systemd-sysusers")
+
+
+@pytest.mark.skipif(SYSTEMD_ANALYZE is None, reason="systemd-analyze is missing: the unit is NOT checked")
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
+    # The unit is checked in a root of its own, where its program is "installed" as an empty executable.
+    program = re.search(r"^ExecStart=(\S+)", SERVICE.read_text(), re.MULTILINE)
+    assert program is not None
+    installed = tmp_path / program[1].lstrip("/")
+    installed.parent.mkdir(parents=True)
+    installed.touch(mode=0o755)
+    units = tmp_path / "etc/systemd/system"
+    units.mkdir(parents=True)
+    shutil.copy(SERVICE, units)
+    result = subprocess.run(
+        [SYSTEMD_ANALYZE, "verify", "--recursive-errors=no", "--man=no", f"--root={tmp_path}", SERVICE.name],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout + result.stderr) == (0, "")
+
+
+@pytest.mark.skipif(SYSTEMD_ANALYZE is None, reason="systemd-analyze is missing: the hardening is NOT checked")
+def test_the_unit_is_hardened():
+    result = subprocess.run(
+        [SYSTEMD_ANALYZE, "security", "--offline=true", "--threshold=20", "--no-pager", str(SERVICE)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "Overall exposure level" in result.stdout
+
+
+def test_a_wrong_configuration_is_not_tried_again_and_anything_else_is_for_ever():
+    unit = SERVICE.read_text().splitlines()
+    assert {"Type=notify", "Restart=on-failure", "RestartPreventExitStatus=78", "StartLimitIntervalSec=0"} <= set(unit)
+
+
+@pytest.mark.skipif(SYSTEMD_SYSUSERS is None, reason="systemd-sysusers is missing: the user is NOT made")
+def test_the_user_is_made_and_may_open_serial_ports(tmp_path):
+    (tmp_path / "etc").mkdir()
+    folder = tmp_path / "usr/lib/sysusers.d"
+    folder.mkdir(parents=True)
+    shutil.copy(DEPLOY / "psiu-broker.sysusers", folder / "psiu-broker.conf")
+    subprocess.run(
+        [SYSTEMD_SYSUSERS, f"--root={tmp_path}", "psiu-broker.conf"], check=True, capture_output=True, text=True
+    )
+    users = (tmp_path / "etc/passwd").read_text()
+    groups = (tmp_path / "etc/group").read_text()
+    assert re.search(r"^psiu-broker:.*nologin$", users, re.MULTILINE)
+    assert re.search(r"^dialout:.*[:,]psiu-broker$", groups, re.MULTILINE)
+
+
+def test_the_modules_of_every_allowed_device_are_loaded_before_the_service_starts():
+    modules = {
+        line for line in (DEPLOY / "psiu-broker.modules-load").read_text().splitlines() if not line.startswith("#")
+    }
+    allowed = set(re.findall(r"^DeviceAllow=char-(\S+) rw$", SERVICE.read_text(), re.MULTILINE))
+    built_in = {"ttyAMA", "ttyS"}
+    of = {"ttyUSB": "usbserial", "ttyACM": "cdc_acm", "rfcomm": "rfcomm"}
+    assert {of[device] for device in allowed - built_in} == modules
+
+
+def test_the_udev_rules_read_as_udev_rules():
+    word = r'[A-Z_]+(\{[A-Za-z0-9_.]+\})?(==|!=|=|\+=|:=)"[^"]*"'
+    rules = [
+        line for line in (DEPLOY / "psiu-broker.rules").read_text().splitlines() if line and not line.startswith("#")
+    ]
+    assert rules
+    for rule in rules:
+        assert re.fullmatch(f"{word}(, {word})*", rule), rule
+    jumps = {label for rule in rules for label in re.findall(r'GOTO="(\w+)"', rule)}
+    assert jumps == {label for rule in rules for label in re.findall(r'LABEL="(\w+)"', rule)}
+
+
+def test_the_example_is_the_readme_s_configuration_and_loads_without_a_warning():
+    configuration = load(EXAMPLE)
+    assert list(configuration.links) == ["radio", "wifi", "arm"]
+    assert list(configuration.robots) == ["BRACO"]
+    assert configuration.warnings == ()
+
+
+def test_the_changelog_tells_of_this_version():
+    assert f"## {__version__}" in (TREE / "CHANGELOG.md").read_text()
