@@ -101,7 +101,7 @@ class Calls:
             return None
 
     def _sift_put(self, sample: zenoh.Sample) -> _Accepted | None:
-        if sample.kind is not zenoh.SampleKind.PUT:
+        if sample.kind != zenoh.SampleKind.PUT:
             return None
         try:
             return self._accepted(str(sample.key_expr), sample.payload, None)

@@ -119,7 +119,7 @@ class Client:
         try:
             with self._session.declare_subscriber(_checked(key), zenoh.handlers.RingChannel(65_536)) as subscriber:
                 for sample in subscriber:
-                    kind: Literal["put", "delete"] = "delete" if sample.kind is zenoh.SampleKind.DELETE else "put"
+                    kind: Literal["put", "delete"] = "delete" if sample.kind == zenoh.SampleKind.DELETE else "put"
                     yield str(sample.key_expr), kind, sample.payload.to_bytes()
         except zenoh.ZError as error:
             raise BusError(f"zenoh: {plain(error)}") from error

@@ -15,7 +15,7 @@ from psiu_broker.bus.keys import Keys, robot
 from psiu_broker.bus.session import JSON, Session, json_of, plain
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Card, Health, Ledger, Link, Message, Route, Status, Why
+from psiu_broker.messages import Card, Health, Ledger, Link, Route, Status, Why
 
 logger = logging.getLogger(__name__)
 
@@ -143,16 +143,15 @@ class Queries:
         values = {key: (encoding, table()) for key, (encoding, table) in self._tables.items() if asked.intersects(key)}
         if values:
             return values
-        _, what = self._keys.read_broker(str(asked))
-        if what[0] == "why" and len(what) == 3 and "*" not in str(asked):
-            return {str(asked): (json_of("Why"), self._why(*what[1:]))}
-        raise CallError("bad_request", f"{asked} is none of {', '.join(self._tables)} and why/A/B")
-
-    def _why(self, a: str, b: str) -> Message:
         try:
-            return self._source.why(robot(a), robot(b))
+            _, what = self._keys.read_broker(str(asked))
+            pair = [robot(each) for each in what[1:]] if what[:1] == ["why"] and "*" not in "".join(what) else []
         except ValueError as error:
-            raise CallError("bad_request", f"not a robot's name: {error}") from error
+            raise CallError("bad_request", str(error)) from error
+        if len(pair) == 2:
+            key = "/".join((self._keys.broker(self._broker, "why"), *what[1:]))
+            return {key: (json_of("Why"), self._source.why(*pair))}
+        raise CallError("bad_request", f"{asked} is none of {', '.join(self._tables)} and why/A/B")
 
     def _card_values(self, asked: zenoh.KeyExpr) -> Values:
         cards = {self._keys.card(robot): card for robot, card in self._source.cards().items()}

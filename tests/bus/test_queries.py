@@ -1,0 +1,171 @@
+import asyncio
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+import zenoh
+
+from psiu_broker.bus import queries as queries_module
+from psiu_broker.bus.keys import Keys
+from psiu_broker.bus.queries import Queries
+from psiu_broker.bus.session import Session
+from psiu_broker.errors import BusError
+from psiu_broker.frame import Address
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Refusal, Route, Status, Why
+
+NOW = datetime(2026, 11, 22, tzinfo=UTC)
+
+
+class Broker:
+    """A broker with two robots, one of them with an odd name."""
+
+    robots = (Address.named("MNERIM"), Address.named("0x12"), Address.numbered(0x12))
+
+    def status(self) -> Status:
+        return Status(
+            broker="base",
+            version="0",
+            started=NOW,
+            uptime_s=1,
+            links_open=1,
+            links=1,
+            robots=2,
+            zenoh_id="a",
+            listen=[],
+        )
+
+    def links(self) -> Sequence[Link]:
+        return [Link(name="radio", adapter="serial", protocol="psiu-ascii", state="open", since=NOW)]
+
+    def routes(self) -> Sequence[Route]:
+        return []
+
+    def ledger(self) -> Ledger:
+        total = Account(link="", arrived=0, delivered=0, answered=0)
+        return Ledger(accounts=[], total=total, balances=True)
+
+    def health(self) -> Health:
+        return Health(healthy=True, checks={})
+
+    def config(self) -> Mapping[str, Any]:
+        return {"broker": {"name": "base"}}
+
+    def why(self, a: Address, b: Address) -> Why:
+        if a == Address.named("bug"):
+            raise ZeroDivisionError
+        return Why(a=str(a), b=str(b), delivered=True, verdict=f"{a!r} {b!r}", steps=[])
+
+    def cards(self) -> Mapping[Address, Card]:
+        return {
+            robot: Card(robot=str(robot), protocol="psiu-ascii", broker="base", link="radio", link_state="open")
+            for robot in self.robots
+        }
+
+
+@pytest.fixture
+async def queries(session: Session, keys: Keys) -> Queries:
+    return await Queries.open(session, keys, "base", Broker())
+
+
+async def ask(program: zenoh.Session, key: str) -> dict[str, Any]:
+    """The JSON found, by key; the errors under the empty key."""
+
+    def get() -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for reply in program.get(key, timeout=5):
+            if reply.ok:
+                assert str(reply.ok.encoding).startswith("application/json")
+                assert str(reply.ok.key_expr) not in found
+                found[str(reply.ok.key_expr)] = json.loads(reply.ok.payload.to_string())
+            else:
+                found[""] = Refusal.model_validate_json(reply.err.payload.to_bytes())
+        return found
+
+    return await asyncio.to_thread(get)
+
+
+@pytest.mark.parametrize("what", ["status", "ledger"])
+async def test_a_table_is_one_object(queries: Queries, program: zenoh.Session, what: str) -> None:
+    expected = json.loads(getattr(Broker(), what)().model_dump_json())
+    assert await ask(program, f"psiu/@broker/base/{what}") == {f"psiu/@broker/base/{what}": expected}
+
+
+async def test_lists_are_arrays_and_times_are_rfc_3339(queries: Queries, program: zenoh.Session) -> None:
+    assert await ask(program, "psiu/@broker/base/routes") == {"psiu/@broker/base/routes": []}
+    links = await ask(program, "psiu/@broker/base/links")
+    assert links["psiu/@broker/base/links"][0]["since"] == "2026-11-22T00:00:00.000000Z"
+    assert await ask(program, "psiu/@broker/base/config") == {"psiu/@broker/base/config": {"broker": {"name": "base"}}}
+
+
+async def test_wildcards_get_each_answer_on_its_own_key(queries: Queries, program: zenoh.Session) -> None:
+    every = {f"psiu/@broker/base/{what}" for what in ("status", "links", "routes", "ledger", "health", "config")}
+    assert set(await ask(program, "psiu/@broker/base/*")) == every
+    assert set(await ask(program, "psiu/@broker/**")) == every
+    assert set(await ask(program, "psiu/@broker/*/status")) == {"psiu/@broker/base/status"}
+    assert set(await ask(program, "psiu/@broker/*/why/A/B")) == {"psiu/@broker/base/why/A/B"}
+    assert await ask(program, "psiu/@broker/other/status") == {}
+
+
+async def test_why_names_two_robots(queries: Queries, program: zenoh.Session) -> None:
+    found = await ask(program, "psiu/@broker/base/why/ROB%C3%94/0x12")
+    why = found["psiu/@broker/base/why/ROB%C3%94/0x12"]
+    assert why["verdict"] == f"{Address.named('ROBÔ')!r} {Address.numbered(0x12)!r}"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *(
+            f"psiu/@broker/base{what}"
+            for what in ("", "/nothing", "/why", "/why/A", "/why/*/B", "/why/A/B/C", "/why/%ED%A0%80/A", "/status/x")
+        ),
+        "**/@broker/base/nothing",
+        "psiu/**/@broker/*/nothing",
+    ],
+)
+async def test_an_unknown_question_is_told_what_may_be_asked(
+    queries: Queries, program: zenoh.Session, key: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = await ask(program, key)
+    assert found[""].error == "bad_request"
+    assert caplog.text == ""
+
+
+async def test_a_bug_in_the_broker_is_an_answer_and_a_log_entry(
+    queries: Queries, program: zenoh.Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert (await ask(program, "psiu/@broker/base/why/bug/A"))[""].error == "impossible"
+    assert "failed inside the broker" in caplog.text
+
+
+@pytest.mark.parametrize("key", ["psiu/*", "psiu/**"])
+async def test_all_cards_come_each_on_its_own_key(queries: Queries, program: zenoh.Session, key: str) -> None:
+    found = await ask(program, key)
+    assert set(found) == {"psiu/MNERIM", "psiu/%30x12", "psiu/0x12"}
+    assert Card.model_validate(found["psiu/MNERIM"]).robot == "MNERIM"
+
+
+async def test_one_card_comes_alone_and_a_stranger_has_none(queries: Queries, program: zenoh.Session) -> None:
+    assert set(await ask(program, "psiu/MNERIM")) == {"psiu/MNERIM"}
+    assert await ask(program, "psiu/STRANGER") == {}
+
+
+async def test_many_questions_at_once_all_get_an_answer(
+    queries: Queries, program: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert queries_module.AT_ONCE_MAX == 64
+    handlers = [program.get("psiu/@broker/base/status", timeout=5) for _ in range(300)]
+    replies = await asyncio.to_thread(lambda: [list(handler) for handler in handlers])
+    assert all(len(each) == 1 for each in replies)
+    refusals = [Refusal.model_validate_json(r.err.payload.to_bytes()).error for [r] in replies if r.err]
+    assert set(refusals) <= {"busy"}
+    assert set(await ask(program, "psiu/@broker/base/status")) == {"psiu/@broker/base/status"}
+
+
+async def test_a_round_trip_goes_through_zenoh_and_the_loop(queries: Queries, session: Session) -> None:
+    assert 0 < await queries.round_trip(2) < 2
+    await session.close()
+    with pytest.raises(BusError):
+        await queries.round_trip(1)
