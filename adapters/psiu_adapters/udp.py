@@ -1,0 +1,330 @@
+"""UDP: every (host, port) is a peer; unicast, broadcast and multicast, IPv4 and IPv6."""
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+from collections.abc import Callable, Collection, Mapping
+from typing import ClassVar, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from psiu_adapters.udp_sockets import (
+    Address,
+    bound,
+    is_broadcast,
+    is_multicast,
+    is_own,
+    joined,
+    kernel_drops,
+    numeric,
+    resolve,
+    split,
+)
+from psiu_broker.adapter import Adapter, Peer, Receiver, Transport
+from psiu_broker.errors import LinkError, LinkLost
+
+DATAGRAM_BYTES = 2048
+DRAIN_DATAGRAMS = 32
+SWEEPS = 4
+RESOLVE_FIRST_S = 2.0
+RESOLVE_LAST_S = 60.0
+PASSING = {
+    errno.ECONNREFUSED,
+    errno.ECONNRESET,
+    errno.EHOSTUNREACH,
+    errno.EHOSTDOWN,
+    errno.ENETUNREACH,
+    errno.ENETDOWN,
+    errno.ENETRESET,
+    errno.ENOPROTOOPT,
+    errno.EPROTO,
+    errno.EMSGSIZE,
+    errno.EACCES,
+    errno.ENOBUFS,
+    errno.ENOMEM,
+    errno.EINTR,
+}
+"""What an ICMP message or a full queue may leave on a socket that stays good."""
+
+log = logging.getLogger(__name__)
+
+
+class Udp(Adapter):
+    """A UDP socket, and who may talk through it."""
+
+    datagrams: ClassVar[bool] = True
+
+    listen: str = Field(
+        description="host:port or [IPv6]:port to listen on, port 0 for any; broadcasts are heard only on 0.0.0.0"
+    )
+    peers: tuple[str, ...] = Field(
+        default=(), description="host:port of each robot known beforehand, or of a broadcast or multicast group"
+    )
+    interface: str = Field(default="", description="name of the network interface for multicast groups, such as wlan0")
+    learn: bool = Field(default=True, description="also talk with whoever sends to us; false: only with `peers`")
+    max_peers: int = Field(default=64, ge=1, description="how many senders are learned; the rest are refused")
+    peer_ttl_s: float = Field(default=300.0, gt=0, description="a learned sender silent for so long is forgotten")
+    reuse: bool = Field(default=False, description="share the port with other programs that do the same")
+
+    @field_validator("listen")
+    @classmethod
+    def _check_listen(cls, value: str) -> str:
+        split(value)
+        return value
+
+    @field_validator("peers")
+    @classmethod
+    def _check_peers(cls, values: tuple[str, ...]) -> tuple[str, ...]:
+        for value in values:
+            if split(value)[1] == 0:
+                raise ValueError(f"{value!r} has no port to send to: expected 1–65535")
+        return values
+
+    @model_validator(mode="after")
+    def _check_families(self) -> Self:
+        ours = numeric(self.listen)
+        for peer in self.peers:
+            theirs = numeric(peer)
+            if ours and theirs and ours[0] != theirs[0]:
+                raise ValueError(
+                    f"listen = {self.listen!r} and the peer {peer!r} cannot talk: one IPv4, the other IPv6"
+                )
+        return self
+
+    async def open(self, receiver: Receiver) -> Transport:
+        family, address = await resolve(self.listen, socket.AF_UNSPEC)
+        transport = _UdpTransport(self, family, bound(family, address, self.listen, reuse=self.reuse), receiver)
+        try:
+            await transport.begin()
+        except BaseException:
+            await transport.close()
+            raise
+        return transport
+
+
+class _Entry:
+    """One peer: the very object that `Receiver.received` is told, where to send, and how long it has been silent."""
+
+    __slots__ = ("address", "fixed", "peer", "silent")
+
+    def __init__(self, peer: tuple[str, int], address: Address, fixed: bool) -> None:
+        self.peer = peer
+        self.address = address
+        self.fixed = fixed
+        self.silent = 0
+
+
+class _UdpTransport(Transport):
+    """`_by_address` answers "who sent this", `_by_peer` "where to"; both hold the same entries."""
+
+    def __init__(self, options: Udp, family: int, main: socket.socket, receiver: Receiver) -> None:
+        self._options = options
+        self._family = family
+        self._receiver = receiver
+        self._loop = asyncio.get_running_loop()
+        self._main = main
+        self._sendto = main.sendto
+        self._sockets = [main]
+        self._by_address: dict[Address, _Entry] = {}
+        self._by_peer: dict[Peer, _Entry] = {}
+        self._everyone: tuple[Peer, ...] = ()
+        self._groups = False
+        self._own: set[Address] = set()
+        self._reading = False
+        self._unresolved = list(options.peers)
+        self._learned = 0
+        self._refused = 0
+        self._oversized = 0
+        self._send_errors = 0
+        self._blocked = False
+        self._closed = False
+        self._sweeper: asyncio.TimerHandle | None = None
+        self._resolver: asyncio.Task[None] | None = None
+
+    async def begin(self) -> None:
+        """Find the fixed peers, join their groups, and read from now on.
+
+        Raises:
+            LinkError: a group cannot be joined.
+        """
+        for text in self._options.peers:
+            if found := numeric(text):
+                self._add_fixed(text, found[1])
+        if self._unresolved:
+            self._resolver = self._loop.create_task(self._resolve())
+            await asyncio.wait({self._resolver}, timeout=RESOLVE_FIRST_S)
+        for receiving in self._sockets:
+            self._read_from(receiving)
+        self._reading = True
+        self._sweeper = self._loop.call_later(self._options.peer_ttl_s / SWEEPS, self._sweep)
+
+    @property
+    def peers(self) -> Collection[Peer]:
+        """Fixed and learned; the fixed alone where a group is among them, or its members would hear all twice."""
+        return self._everyone
+
+    def write(self, data: bytes, peer: Peer) -> bool:
+        entry = self._by_peer.get(peer)
+        if entry is None:
+            return True
+        try:
+            self._sendto(data, entry.address)
+        except BlockingIOError:
+            if not self._blocked:
+                self._blocked = True
+                self._loop.add_writer(self._main.fileno(), self._has_room)
+            return False
+        except OSError:
+            self._send_errors += 1
+        return True
+
+    async def close(self) -> None:
+        if self._closed:
+            return
+        self._stop()
+        if self._resolver is not None:
+            self._resolver.cancel()
+            await asyncio.wait({self._resolver})
+
+    def status(self) -> Mapping[str, str | int | float]:
+        facts: dict[str, str | int | float] = {
+            "peers": len(self._by_peer),
+            "refused": self._refused,
+            "oversized": self._oversized,
+            "send_errors": self._send_errors,
+        }
+        if not self._closed:
+            host, port = self._main.getsockname()[:2]
+            facts["listen"] = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+            facts["lost"] = sum(map(kernel_drops, self._sockets))
+        if self._unresolved:
+            facts["unresolved"] = ", ".join(self._unresolved)
+        return facts
+
+    def _read_from(self, receiving: socket.socket) -> None:
+        self._loop.add_reader(receiving.fileno(), self._reader(receiving))
+
+    def _reader(self, receiving: socket.socket) -> Callable[[], None]:
+        """The callback for a readable socket: what it needs is bound once, for it runs for every datagram."""
+        recvfrom = receiving.recvfrom
+        known = self._by_address.get
+        received = self._receiver.received
+        turns = range(DRAIN_DATAGRAMS)
+
+        def read() -> None:
+            for _ in turns:
+                try:
+                    data, address = recvfrom(DATAGRAM_BYTES + 1)
+                except BlockingIOError:
+                    return
+                except OSError as error:
+                    if error.errno in PASSING:
+                        continue
+                    self._lose(error)
+                    return
+                entry = known(address)
+                if entry is None:
+                    entry = self._stranger(address)
+                    if entry is None:
+                        continue
+                entry.silent = 0
+                if len(data) > DATAGRAM_BYTES:
+                    self._oversized += 1
+                    data = data[:DATAGRAM_BYTES]
+                received(data, entry.peer)
+
+        return read
+
+    def _stranger(self, address: Address) -> _Entry | None:
+        """The new entry for `address`; None if it is ourselves, or one too many."""
+        if self._groups and (address in self._own or is_own(self._main, address)):
+            self._own.add(address)
+            return None
+        if not self._options.learn or self._learned >= self._options.max_peers:
+            self._refused += 1
+            return None
+        self._learned += 1
+        return self._add(address, fixed=False)
+
+    def _add(self, address: Address, *, fixed: bool) -> _Entry:
+        entry = self._by_address.get(address)
+        if entry is None:
+            entry = _Entry((address[0], address[1]), address, fixed)
+            self._by_address[address] = self._by_peer[entry.peer] = entry
+        elif fixed and not entry.fixed:
+            entry.fixed = True
+            self._learned -= 1
+        self._count_everyone()
+        return entry
+
+    def _count_everyone(self) -> None:
+        self._everyone = tuple(entry.peer for entry in self._by_peer.values() if entry.fixed or not self._groups)
+
+    def _sweep(self) -> None:
+        """Forget the learned peers that were silent for all of `peer_ttl_s`."""
+        self._sweeper = self._loop.call_later(self._options.peer_ttl_s / SWEEPS, self._sweep)
+        gone = []
+        for entry in self._by_peer.values():
+            entry.silent += 1
+            if entry.silent > SWEEPS and not entry.fixed:
+                gone.append(entry)
+        if not gone:
+            return
+        for entry in gone:
+            del self._by_address[entry.address], self._by_peer[entry.peer]
+        self._learned -= len(gone)
+        self._count_everyone()
+        for entry in gone:
+            self._receiver.peer_lost(entry.peer)
+
+    async def _resolve(self) -> None:
+        """Add the fixed peers that are known by name, each once its name has an address."""
+        pause_s = RESOLVE_FIRST_S
+        while True:
+            for text in list(self._unresolved):
+                try:
+                    _, address = await resolve(text, self._family)
+                    self._add_fixed(text, address)
+                except LinkError as error:
+                    log.debug("%s", error)
+            if not self._unresolved:
+                return
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, RESOLVE_LAST_S)
+
+    def _add_fixed(self, text: str, address: Address) -> None:
+        if is_multicast(address):
+            extra = joined(self._main, address, self._options.interface)
+            if extra is not None:
+                self._sockets.append(extra)
+                if self._reading:
+                    self._read_from(extra)
+            self._groups = True
+        elif is_broadcast(self._family, address):
+            self._groups = True
+        self._unresolved.remove(text)
+        self._add(address, fixed=True)
+
+    def _has_room(self) -> None:
+        self._blocked = False
+        self._loop.remove_writer(self._main.fileno())
+        self._receiver.writable()
+
+    def _lose(self, error: OSError) -> None:
+        if not self._closed:
+            self._stop()
+            self._receiver.lost(LinkLost(f"{self._options.listen}: {os.strerror(error.errno or 0).lower()}"))
+
+    def _stop(self) -> None:
+        self._closed = True
+        self._by_address.clear()
+        self._by_peer.clear()
+        self._everyone = ()
+        if self._sweeper is not None:
+            self._sweeper.cancel()
+        for each in self._sockets:
+            self._loop.remove_reader(each.fileno())
+            self._loop.remove_writer(each.fileno())
+            each.close()
