@@ -17,6 +17,9 @@ LONGEST_PAYLOAD: Final = 251
 PATIENCE_S: Final = 0.1
 """A packet that stops this long in the middle is forgotten."""
 
+PIECE_PATIENCE_S: Final = 1.0
+"""A message in pieces whose next piece stays away this long is forgotten."""
+
 MOST_REPEATS: Final = 3
 """How often in a row a NAK makes the robot send its last packet again."""
 
@@ -116,6 +119,7 @@ class HexaRobot(Robot):
         self._pinged: set[int] = set()
         self._asked: set[int] = set()
         self._pieces: dict[int, bytearray] = {}
+        self._piece_at = -math.inf
 
     def receive(self, data: bytes, now: float) -> list[Reply]:
         if now - self._last_byte > PATIENCE_S:
@@ -138,7 +142,7 @@ class HexaRobot(Robot):
 
     def telemetry(self) -> bytes:
         nodes = [bytes([node, signal]) for node, signal in sorted(self.signals.items())][:80]
-        return self.packet(self._master, complex_payload(nodes or [b""]))
+        return self.packet(self._master, complex_payload(nodes or [bytes(2)]))
 
     def ping(self, destination: int) -> bytes:
         """A ping of ours; the answer is noted, not answered."""
@@ -161,7 +165,7 @@ class HexaRobot(Robot):
 
     def _send(self, destination: int, payload: bytes) -> bytes:
         self._last_sent = (self._peer(destination), payload)
-        if len(payload) < LONGEST_PAYLOAD or (len(payload) == LONGEST_PAYLOAD and not self._fragment):
+        if len(payload) <= LONGEST_PAYLOAD:
             return self._pack(destination, payload)
         if not self._fragment:
             raise ValueError(f"a payload of {len(payload)} bytes: one packet has room for {LONGEST_PAYLOAD}")
@@ -199,13 +203,17 @@ class HexaRobot(Robot):
             return [self._pack(source, bytes([NAK]))] if spoken_to and not _settles(payload) else []
         if destination != self.address or source == self.address:
             return []
-        if self._fragment and (source in self._pieces or len(payload) == LONGEST_PAYLOAD):
+        begins = len(payload) == LONGEST_PAYLOAD and complex_fields(payload) is None
+        if self._fragment and (begins or source in self._pieces):
             return self._collect(source, payload, now)
         self._note(source, payload, now)
         answer = self._answer(source, payload, now)
         return [] if answer is None else [self._send(source, answer)]
 
     def _collect(self, source: int, piece: bytes, now: float) -> list[bytes]:
+        if now - self._piece_at > PIECE_PATIENCE_S:
+            self._pieces.clear()
+        self._piece_at = now
         pieces = self._pieces.setdefault(source, bytearray())
         pieces += piece
         if len(piece) == LONGEST_PAYLOAD and len(pieces) < LONGEST_MESSAGE:
@@ -227,6 +235,8 @@ class HexaRobot(Robot):
 
     def _answer(self, source: int, payload: bytes, now: float) -> bytes | None:
         """The payload of the answer to a packet with `payload`, None where there is none."""
+        if payload != bytes([NAK]):
+            self._repeats = 0
         if not payload:
             if source in self._pinged:
                 self._pinged.discard(source)
@@ -243,7 +253,6 @@ class HexaRobot(Robot):
         if command == NAK and destination == source and self._repeats < MOST_REPEATS:
             self._repeats += 1
             return last
-        self._repeats = 0
         if command in _NEVER_ANSWERED:
             self._asked.discard(source)
             return None
