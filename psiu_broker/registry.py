@@ -45,7 +45,7 @@ def adapter_class(name: str) -> type[Adapter]:
     entry = found[name]
     try:
         loaded = entry.load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         # Somebody else's module may fail in any way when it is imported, and only its own links may suffer.
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise UnknownAdapter(f"the adapter {name!r} ({entry.value}) cannot be loaded: {reason}") from error
