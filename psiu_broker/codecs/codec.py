@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
+
+from pydantic import BaseModel
 
 from psiu_broker.frame import Frame, Malformed
 
@@ -26,10 +28,16 @@ class Codec(ABC):
     """One stream's worth of one protocol. `now` is in seconds on any steady clock."""
 
     protocol: ClassVar[str]
+    Options: ClassVar[type[BaseModel]]
+    """What the user may write for this protocol in ``[links.NAME]``."""
     dialect: str
     """The exact form on the wire; a frame heard in the same dialect is forwarded as it came."""
     silence_s: float
     """A silence this long ends whatever was begun: the link then calls `flush`."""
+
+    @abstractmethod
+    def __init__(self, options: Any, directory: Directory) -> None:
+        """`options` is an instance of this class's `Options`."""
 
     @abstractmethod
     def decode(self, data: bytes, now: float) -> Sequence[Event]:

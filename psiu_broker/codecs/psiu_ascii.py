@@ -1,0 +1,293 @@
+"""PSIU ASCII: frames of printable words, ended by the sum of their bytes.
+
+    MNERIM 034 parafrente 100 PC 02123
+    dest.  size  message      src checksum
+
+How it is read. A frame lies within a *run* of printable bytes; anything else ends the run, and
+the end of a line, of a datagram or a silence is a *boundary* besides. Nothing marks the
+beginning of a frame, but every *ending*, a space and five digits, names the sum of what stands
+before it, and sums only grow: two bisections in the running sums find each place where a frame
+with that ending can begin. From there the first `` ddd `` is its size field. If it tells the true
+length the fit is *exact*, otherwise *loose*: accepted where a word begins, and remarked upon,
+unless `strict`.
+
+Which fit counts. The first size field since the last frame has the first word: while the length
+that it claims can still come, only its own exact frame is taken, so that a message may quote
+other frames. Once its claim has failed, or the run has ended, endings are taken in their order;
+hence a size corrupted to 999 only delays the good frames behind it, by its claim or a short
+silence (`RIPE_S`), and never swallows them. At a boundary the checksum may lack its zero.
+
+All of this depends on the bytes alone, so however the stream is cut, the frames are the same. A
+few thousand bytes are held at most, and an ending is looked into once. `ascii_run.Run` finds the
+fits; the codec makes frames of them.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import ClassVar, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from psiu_broker.codecs.ascii_run import CHECKSUM_FIELD, COMPLAINT_TEXT, LONGEST, SIZE_FIELD, Fit, Run
+from psiu_broker.codecs.checksums import byte_sum
+from psiu_broker.codecs.codec import Codec, Directory, Event
+from psiu_broker.codecs.noise import NOISE, Noise
+from psiu_broker.errors import EncodeError
+from psiu_broker.frame import COMPLAINT, Address, Frame, Malformed
+
+__all__ = ["PsiuAscii", "message"]
+
+PROTOCOL: Final = "psiu-ascii"
+
+RIPE_S: Final = 0.02
+"""The silence that decides for a whole frame held back by the claim of an earlier size field."""
+
+_CANONICAL: Final = "psiu-ascii/1"
+_LOOSE: Final = "psiu-ascii/1/loose"
+_CRLF: Final = "psiu-ascii/1/crlf"
+
+_BAD_CHECKSUM: Final = "checksum"
+_BAD_SIZE: Final = "size"
+_UNFINISHED: Final = "unfinished"
+
+_PIECE: Final = re.compile(rb"([ -~]+)|([\r\n]+)|[^ -~\r\n]+")
+_PRINTABLE: Final = re.compile(rb"[!-~][ -~]*")
+_MISREAD: Final = re.compile(rb" \d{3}( |\Z)")
+
+_SIZES: Final = tuple(b"%03d" % size for size in range(LONGEST + 1))
+
+_STEP: Final = 1024
+_MOST_WORDS: Final = 1024
+"""Names, and command words, that are remembered as text."""
+
+# Frame(...) goes through a Python function; this is the same without it, on the path that nearly every frame takes.
+_make = tuple.__new__
+
+
+def message(source: Address, destination: Address, *words: str) -> Frame:
+    """A frame of our own, to be encoded: a command or answer and its parameters (PSIU ASCII, Campos do pacote)."""
+    # A lone surrogate stays a byte that `encode` refuses, rather than an exception here or a word that was never said.
+    payload = " ".join(words).encode("utf-8", "surrogatepass")
+    return Frame(source, destination, words[0] if words else "", payload, PROTOCOL)
+
+
+class PsiuAscii(Codec):
+    """One stream of PSIU ASCII frames."""
+
+    protocol: ClassVar[str] = PROTOCOL
+
+    class Options(BaseModel):
+        """What the user may write for a PSIU ASCII link."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True)
+
+        version: Literal["1"] = Field("1", description="the draft of the protocol; 1 is the document")
+        strict: bool = Field(False, description="refuse frames with a wrong size or a checksum without its zero")
+        line_end: Literal["none", "crlf"] = Field(
+            "none", description="what follows a frame that is sent; robots want none"
+        )
+        silence_ms: int = Field(200, ge=20, description="half a frame is given up after such a silence")
+
+    def __init__(self, options: Options, directory: Directory) -> None:
+        self.options = options
+        self.dialect = _CANONICAL if options.line_end == "none" else _CRLF
+        self.silence_s = self._silence_s = options.silence_ms / 1000
+        self._directory = directory
+        self._names: dict[bytes, Address] = {}
+        self._subjects: dict[bytes, str] = {}
+        self._run = Run(strict=options.strict)
+        self._noise = Noise()
+        self._begun = False
+
+    @property
+    def pending(self) -> bool:
+        """True while bytes wait for more."""
+        return self._begun
+
+    def decode(self, data: bytes, now: float) -> Sequence[Event]:
+        """The frames that `data` completes, and in one `Malformed` each run of bytes between them."""
+        if not self._begun:
+            frame = self._whole(data)
+            if frame is not None:
+                return [frame]
+        events: list[Event] = []
+        for piece in _PIECE.finditer(data):
+            if piece[1] is not None:
+                for at in range(piece.start(), piece.end(), _STEP):
+                    self._read(data[at : min(at + _STEP, piece.end())], events)
+            elif piece[2] is not None:
+                self._end_line(events)
+            else:
+                self._end_run(events, boundary=False)
+                self._noise.add(piece[0], events)
+        self._begun = len(self._run.text) > 0 or self._noise.size > 0
+        self.silence_s = RIPE_S if self._run.fits else self._silence_s
+        return events
+
+    def flush(self, now: float) -> Sequence[Event]:
+        """Settle or give up what was begun."""
+        if not self._begun:
+            return ()
+        events: list[Event] = []
+        self._end_line(events)
+        self._begun = False
+        self.silence_s = self._silence_s
+        return events
+
+    def encode(self, frame: Frame) -> bytes:
+        """The frame with its true size and padded checksum, and the line end if one is configured.
+
+        Raises:
+            EncodeError: a name or word cannot be said in printable ASCII, would be read as another, or all is too long.
+        """
+        wire = frame.wire if frame.wire and frame.dialect == _CANONICAL else self._encoded(frame)
+        return wire if self.dialect == _CANONICAL else wire + b"\r\n"
+
+    def _encoded(self, frame: Frame) -> bytes:
+        if frame.protocol != PROTOCOL:
+            raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
+        destination = _name(frame.destination)
+        if _MISREAD.search(destination, 1):
+            raise EncodeError(f"{frame.destination}: three digits alone in a name would be read as the size")
+        body = b"%b %b " % (_words(frame.payload, "a message"), _name(frame.source))
+        size = len(destination) + 5 + len(body) + 5
+        if size > LONGEST:
+            raise EncodeError(f"the frame would have {size} bytes, of which three digits can only say {LONGEST}")
+        summed = destination + b" %b " % _SIZES[size] + body
+        return b"%b%05d" % (summed, byte_sum(summed))
+
+    def _whole(self, data: bytes) -> Frame | None:
+        """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case."""
+        words = data.split(b" ")
+        if len(words) < 5:
+            return None
+        checksum = words[-1]
+        if len(checksum) == 7 and checksum[5:] == b"\r\n":
+            checksum = checksum[:5]
+            data = data[:-2]
+        size = len(data)
+        if size > LONGEST or words[1] != _SIZES[size] or checksum != b"%05d" % byte_sum(data[:-5]):
+            return None
+        source = self._names.get(words[-2])
+        destination = self._names.get(words[0])
+        subject = self._subjects.get(words[2])
+        if source is None or destination is None or subject is None or not data.isascii():
+            return None
+        text = data.decode()
+        end = -7 - len(words[-2])
+        if not text.isprintable() or (
+            len(words) > 5 and self._sender(text, len(words[0]) + 6, size + end, size - 6) != size + end
+        ):
+            return None
+        payload = data[len(words[0]) + 5 : end]
+        return _make(Frame, (source, destination, subject, payload, PROTOCOL, data, _CANONICAL, ""))
+
+    def _sender(self, text: str, start: int, space: int, end: int) -> int:
+        """The space before the sender's name, which ends at `end`: the longest known one, else the word after `space`.
+
+        `start` is the second byte of the message, of which the name leaves at least one.
+        """
+        names = self._directory.names
+        longest = space
+        while names and (space := text.rfind(" ", start, space)) > 0:
+            if text[space + 1 : end] in names:
+                longest = space
+        return longest
+
+    def _read(self, text: bytes, events: list[Event]) -> None:
+        self._run.read(text)
+        self._settle(events, ended=False)
+        self._waste(self._run.forget(), events)
+
+    def _end_line(self, events: list[Event]) -> None:
+        self._end_run(events, boundary=True)
+        self._end_noise(events)
+
+    def _end_run(self, events: list[Event], *, boundary: bool) -> None:
+        """Settle the run, since no frame goes beyond it; what is left is noise."""
+        run = self._run
+        if run.text:
+            self._settle(events, ended=True)
+            if boundary:
+                run.read_unpadded()
+                self._settle(events, ended=True)
+            self._waste(run.settle(len(run.text)), events)
+            run.clear()
+
+    def _settle(self, events: list[Event], *, ended: bool) -> None:
+        run = self._run
+        while (fit := run.next(ended=ended)) is not None:
+            self._waste(run.settle(fit.start), events)
+            self._end_noise(events)
+            is_complaint = fit.field < 0
+            events.append(
+                Malformed(COMPLAINT, COMPLAINT_TEXT, len(COMPLAINT_TEXT)) if is_complaint else self._frame(fit)
+            )
+            run.accept(fit)
+
+    def _frame(self, fit: Fit) -> Frame:
+        wire = bytes(self._run.text[fit.start : fit.end])
+        text = wire.decode("ascii")
+        field = fit.field - fit.start
+        end = fit.space - fit.start
+        sender = self._sender(text, field + 6, text.rindex(" ", 0, end), end)
+        payload = wire[field + 5 : sender]
+        dialect, remark = _CANONICAL, ""
+        if not fit.exact:
+            dialect = _LOOSE
+            unpadded = fit.end - fit.space < 6
+            remark = "checksum not padded" if unpadded else f"size {text[field + 1 : field + 4]}, not {len(wire):03}"
+        source = self._address(wire[sender + 1 : end])
+        destination = self._address(wire[:field])
+        return Frame(source, destination, self._subject(payload), payload, PROTOCOL, wire, dialect, remark)
+
+    def _address(self, name: bytes) -> Address:
+        address = self._names.get(name)
+        if address is None:
+            if len(self._names) >= _MOST_WORDS:
+                self._names.clear()
+            address = self._names[name] = Address.named(name.decode("ascii"))
+        return address
+
+    def _subject(self, payload: bytes) -> str:
+        word = payload.split(b" ", 1)[0]
+        subject = self._subjects.get(word)
+        if subject is None:
+            if len(self._subjects) >= _MOST_WORDS:
+                self._subjects.clear()
+            subject = self._subjects[word] = word.decode("ascii")
+        return subject
+
+    def _waste(self, text: bytes, events: list[Event]) -> None:
+        """`text` was no frame: it is noise, and the spaces that noise begins with are nothing at all."""
+        self._noise.add(text if self._noise.size else text.lstrip(b" "), events)
+
+    def _end_noise(self, events: list[Event]) -> None:
+        if self._noise.size:
+            self._noise.end(self._reason(), events)
+
+    def _reason(self) -> str:
+        """Why the noise was no frame, as far as it looks like one."""
+        kept = bytes(self._noise.kept)
+        if self._noise.size > LONGEST or not (field := SIZE_FIELD.search(kept, 1)):
+            return NOISE
+        summed = kept.rfind(b" ") + 1
+        ending = kept[summed:]
+        if len(ending) in {4, 5} and ending.isdigit():
+            return _BAD_SIZE if byte_sum(kept[:summed]) == int(ending) else _BAD_CHECKSUM
+        return _BAD_CHECKSUM if CHECKSUM_FIELD.search(kept, field.end() - 1) else _UNFINISHED
+
+
+def _name(address: Address) -> bytes:
+    if address.is_numbered:
+        raise EncodeError(f"{address} is a number; PSIU ASCII knows robots by name")
+    name = _words(address.name.encode("utf-8", "surrogatepass"), "a name")
+    if name.endswith(b" "):
+        raise EncodeError(f"{address.name!r}: a name cannot end in a space")
+    return name
+
+
+def _words(words: bytes, what: str) -> bytes:
+    if not _PRINTABLE.fullmatch(words):
+        raise EncodeError(f"{words.decode('utf-8', 'replace')!r}: {what} is printable ASCII, not empty, no space first")
+    return words
