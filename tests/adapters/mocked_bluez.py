@@ -1,0 +1,167 @@
+"""A private system bus with a mocked bluetoothd on it, and robots that are Unix sockets."""
+
+import asyncio
+import contextlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from adapter_contract import PATIENCE_S, Recorder
+from dbus_fast import BusType, Message, MessageType
+from dbus_fast.aio import MessageBus
+
+from psiu_adapters.rfcomm import Rfcomm
+from psiu_broker.adapter import Transport
+
+SYSTEM_PYTHON = "/usr/bin/python3"
+TEMPLATE = Path(__file__).parent / "bluez_mock.py"
+ROBOT = "98:D3:31:00:00:01"
+OTHER = "98:D3:31:00:00:02"
+PAIRED = {ROBOT: {"paired": True}}
+BOTH = {**PAIRED, OTHER: {"paired": True}}
+
+Ends = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+def missing() -> str:
+    """The Debian package that these tests need and this machine lacks."""
+    if not shutil.which("dbus-daemon"):
+        return "dbus-daemon is missing: apt-get install dbus-daemon"
+    probe = "import dbusmock, gi"
+    if (
+        not Path(SYSTEM_PYTHON).exists()
+        or subprocess.run([SYSTEM_PYTHON, "-c", probe], capture_output=True, check=False).returncode
+    ):
+        return "dbusmock is missing in the system's Python: apt-get install python3-dbusmock python3-gi"
+    return ""
+
+
+MISSING = missing() if sys.platform == "linux" else "D-Bus is for Linux"
+needs_mock = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+
+
+class Robot:
+    """A robot that is switched on: whoever connects is `joined`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._server: asyncio.Server | None = None
+        self._joined: asyncio.Queue[Ends] = asyncio.Queue()
+
+    async def __aenter__(self) -> "Robot":
+        self._server = await asyncio.start_unix_server(lambda *ends: self._joined.put_nowait(ends), self._path)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._server is not None
+        self._server.close()
+        self._path.unlink(missing_ok=True)
+        while not self._joined.empty():
+            self._joined.get_nowait()[1].close()
+
+    async def joined(self) -> Ends:
+        async with asyncio.timeout(PATIENCE_S):
+            return await self._joined.get()
+
+
+class Bluetooth:
+    """A private system bus with a mocked bluetoothd on it."""
+
+    def __init__(self, folder: Path, bus: subprocess.Popen[str]) -> None:
+        self.folder = folder
+        self.bus_daemon = bus
+        self.process: subprocess.Popen[bytes] | None = None
+        self._bus: MessageBus | None = None
+        self._owned = asyncio.Event()
+
+    def robot(self, address: str = ROBOT) -> Robot:
+        return Robot(self.folder / address.replace(":", "_"))
+
+    async def start(self, **parameters: Any) -> None:
+        """bluetoothd starts and is ready."""
+        bus = await self.steering()
+        text = json.dumps({"robots": str(self.folder), **parameters})
+        command = [SYSTEM_PYTHON, "-m", "dbusmock", "--system", "--template", str(TEMPLATE), "-p", text]
+        self.process = await asyncio.to_thread(
+            subprocess.Popen, command, stdout=subprocess.DEVNULL, cwd=self.folder, start_new_session=True
+        )
+        async with asyncio.timeout(20):
+            await self._owned.wait()
+            await bus.call(Message("org.bluez", "/", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects"))
+
+    async def stop(self) -> None:
+        """bluetoothd dies."""
+        if self.process is not None:
+            self.process.kill()
+            await asyncio.to_thread(self.process.wait)
+            self.process = None
+            self._owned.clear()
+
+    async def steer(self, member: str, signature: str = "", *body: Any) -> Any:
+        bus = await self.steering()
+        reply = await bus.call(Message("org.bluez", "/", "org.psiu.Mock", member, signature=signature, body=list(body)))
+        assert reply is not None
+        assert reply.message_type is MessageType.METHOD_RETURN, reply.body
+        return reply.body[0] if reply.body else None
+
+    async def log(self) -> list[str]:
+        return list(await self.steer("Log"))
+
+    async def steering(self) -> MessageBus:
+        if self._bus is None:
+            self._bus = await MessageBus(bus_type=BusType.SYSTEM).connect()
+            self._bus.add_message_handler(self._signal)
+            rule = "type='signal',member='NameOwnerChanged',arg0='org.bluez'"
+            bus = "org.freedesktop.DBus"
+            await self._bus.call(Message(bus, "/org/freedesktop/DBus", bus, "AddMatch", signature="s", body=[rule]))
+        return self._bus
+
+    def _signal(self, message: Message) -> None:
+        if message.member == "NameOwnerChanged" and message.body[0] == "org.bluez" and message.body[2]:
+            self._owned.set()
+
+    async def close(self) -> None:
+        await self.stop()
+        if self._bus is not None:
+            self._bus.disconnect()
+            await self._bus.wait_for_disconnect()
+
+
+@contextlib.contextmanager
+def system_bus(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[str]]:
+    """A private dbus-daemon, which is the system bus meanwhile."""
+    command = ["dbus-daemon", "--session", "--nofork", "--print-address=1", f"--address=unix:path={folder}/bus"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as daemon:
+        assert daemon.stdout is not None
+        monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", daemon.stdout.readline().strip())
+        try:
+            yield daemon
+        finally:
+            daemon.kill()
+
+
+@contextlib.asynccontextmanager
+async def mocked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Bluetooth]:
+    """A bus without bluetoothd, which `Bluetooth.start` starts."""
+    robots = folder / "robots"
+    robots.mkdir()
+    with system_bus(folder, monkeypatch) as bus:
+        bluetooth = Bluetooth(robots, bus)
+        try:
+            yield bluetooth
+        finally:
+            await bluetooth.close()
+
+
+@contextlib.asynccontextmanager
+async def opened(adapter: Rfcomm, recorder: Recorder) -> AsyncIterator[Transport]:
+    transport = await adapter.open(recorder)
+    try:
+        yield transport
+    finally:
+        await transport.close()

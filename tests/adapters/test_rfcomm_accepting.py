@@ -1,0 +1,98 @@
+"""RFCOMM: phones and robots that call us."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from adapter_contract import Recorder, descriptors_become, open_descriptors
+from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, mocked, needs_mock, opened
+
+from psiu_adapters.rfcomm import Rfcomm
+from psiu_broker.errors import LinkBusy
+
+pytestmark = needs_mock
+
+
+@pytest.fixture
+async def bluetooth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Bluetooth]:
+    async with mocked(tmp_path, monkeypatch) as bluetooth:
+        yield bluetooth
+
+
+async def test_phones_that_call_are_peers_by_their_address(bluetooth: Bluetooth) -> None:
+    await bluetooth.start(known=BOTH)
+    recorder = Recorder()
+    async with (
+        bluetooth.robot(ROBOT) as one,
+        bluetooth.robot(OTHER) as other,
+        opened(Rfcomm(accept=True), recorder) as transport,
+    ):
+        assert tuple(transport.peers) == ()
+        assert transport.write(b"to nobody", ROBOT)
+        ends = {}
+        for address, phone in ((ROBOT, one), (OTHER, other)):
+            assert await bluetooth.steer("Call", "s", address) == "connected"
+            ends[address] = await phone.joined()
+            ends[address][1].write(address.encode())
+        await recorder.until(lambda: sorted(recorder.heard) == [(ROBOT.encode(), ROBOT), (OTHER.encode(), OTHER)])
+        assert set(transport.peers) == {ROBOT, OTHER}
+        assert transport.write(b"to the other", OTHER)
+        assert await ends[OTHER][0].readexactly(12) == b"to the other"
+        ends[ROBOT][1].close()
+        await recorder.until(lambda: recorder.gone == [ROBOT])
+        assert transport.status()["connected"] == 1
+        assert not recorder.losses
+        await transport.close()
+        assert await ends[OTHER][0].read() == b""
+        ends[OTHER][1].close()
+
+
+async def test_a_phone_that_calls_again_replaces_its_dead_call(bluetooth: Bluetooth) -> None:
+    await bluetooth.start(known=PAIRED)
+    recorder = Recorder()
+    async with bluetooth.robot() as phone, opened(Rfcomm(accept=True), recorder) as transport:
+        await bluetooth.steer("Call", "s", ROBOT)
+        reader, first = await phone.joined()
+        await bluetooth.steer("Call", "s", ROBOT)
+        _, second = await phone.joined()
+        assert await reader.read() == b""
+        second.write(b"again")
+        await recorder.until(lambda: recorder.heard == [(b"again", ROBOT)])
+        assert tuple(transport.peers) == (ROBOT,)
+        assert recorder.gone == [ROBOT]
+        first.close()
+        second.close()
+
+
+async def test_nobody_may_call_when_no_link_accepts(bluetooth: Bluetooth) -> None:
+    await bluetooth.start(known=BOTH)
+    before = open_descriptors()
+    async with bluetooth.robot(ROBOT) as robot, bluetooth.robot(OTHER) as phone:
+        async with opened(Rfcomm(accept=True), Recorder()) as accepting, opened(Rfcomm(address=ROBOT), Recorder()):
+            _, writer = await robot.joined()
+            await accepting.close()
+            assert await bluetooth.steer("Call", "s", OTHER) == "not authorized"
+            assert phone._joined.empty()
+            writer.close()
+    await descriptors_become(before)
+
+
+async def test_bluetoothd_stopping_is_told_to_a_link_that_accepts(bluetooth: Bluetooth) -> None:
+    await bluetooth.start(known=PAIRED)
+    recorder = Recorder()
+    adapter = Rfcomm(accept=True)
+    async with opened(adapter, recorder):
+        await bluetooth.stop()
+        await recorder.until(lambda: recorder.losses)
+        assert len(recorder.losses) == 1
+    await bluetooth.start(known=PAIRED)
+    async with bluetooth.robot() as phone, opened(adapter, Recorder()):
+        assert await bluetooth.steer("Call", "s", ROBOT) == "connected"
+        (await phone.joined())[1].close()
+
+
+async def test_only_one_link_accepts(bluetooth: Bluetooth) -> None:
+    await bluetooth.start()
+    async with opened(Rfcomm(accept=True), Recorder()):
+        with pytest.raises(LinkBusy, match="another link of this broker accepts"):
+            await Rfcomm(accept=True).open(Recorder())
