@@ -2,16 +2,21 @@
 
 import time
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from datetime import UTC, datetime
+from math import inf
+from typing import Literal, Protocol, cast
 
 from psiu_broker.codecs import psiu_ascii
-from psiu_broker.frame import Address, Frame, Malformed, Way
+from psiu_broker.frame import Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
+from psiu_broker.messages import RawFrame
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate
 from psiu_broker.routing.router import SELF, Decision, Port, Router
+from psiu_broker.routing.table import Route
 from psiu_broker.routing.verdicts import (
     ANSWERED,
+    DELIVERED,
     DUPLICATE,
     MALFORMED,
     NO_ROUTE,
@@ -21,15 +26,28 @@ from psiu_broker.routing.verdicts import (
 
 
 class Bus(Protocol):
-    """What the exchange needs of the bus. `listened` and `tapped` are read for each frame."""
+    """What the exchange needs of the bus. `listened` and `raw_listened` are read for each frame."""
 
     listened: bool
     """Somebody listens to decoded frames."""
-    tapped: bool
-    """Somebody listens to raw frames."""
+    raw_listened: bool
+    """Somebody listens to the raw frames of some link."""
 
-    def publish(self, frame: Frame, way: Way) -> None: ...
-    def publish_raw(self, frame: Frame | Malformed, way: Way, verdict: Verdict) -> None: ...
+    def publish(self, frame: Frame, way: Way, received: float) -> None: ...
+    def tapped(self, link: str) -> bool: ...
+    def publish_raw(self, raw: RawFrame) -> None: ...
+
+
+class NoBus:
+    """In the bus's place while there is none: nobody listens."""
+
+    listened = raw_listened = False
+
+    def publish(self, frame: Frame, way: Way, received: float) -> None: ...
+    def tapped(self, link: str) -> bool:
+        return False
+
+    def publish_raw(self, raw: RawFrame) -> None: ...
 
 
 class Resident(Protocol):
@@ -43,6 +61,9 @@ class Resident(Protocol):
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         """Bytes that were no frame: perhaps a robot's complaint, perhaps one to make ourselves."""
+
+    def undelivered(self, frame: Frame, verdict: Verdict) -> None:
+        """A frame of the broker's own that waited was dropped."""
 
     def link_opened(self, link: Link, now: float) -> None: ...
 
@@ -60,95 +81,116 @@ class Exchange:
         self,
         own_name: Address,
         router: Router,
-        bus: Bus,
         holding: Holding | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
     ) -> None:
+        self.bus: Bus = NoBus()
         self.links: dict[str, Link] = {}
         self.accounts: dict[str, Account] = {SELF.link: Account()}
         self.router = router
         self.holding = holding or Holding()
         self.resident: Resident
+        self.withdrawn: Callable[[Route], None] = lambda _: None
+        """Told of each route that is no more."""
         self._ports: dict[str, Port] = {}
+        self._route_age_s: dict[str, float] = {}
         self._own_name = own_name
-        self._bus = bus
-        self._clock = clock
+        self._wall_clock = wall_clock
         self._route = router.route
 
-    def add(self, link: Link, protocol: str, *, wildcard: bool) -> None:
+    def add(self, link: Link) -> None:
         """Take in a link; its books start now."""
         self.links[link.name] = link
         self.accounts[link.name] = Account()
-        self._ports[link.name] = Port(link.name, protocol, link.ways, wildcard)
+        options = link.configuration.options
+        self._ports[link.name] = Port(link.name, link.configuration.protocol, link.ways, options.wildcard)
+        self._route_age_s[link.name] = options.route_age_s
 
-    def heard(self, frame: Frame, way: Way, now: float) -> Verdict | None:
+    def heard(self, frame: Frame, way: Way, now: float, patience_s: float = inf) -> Verdict | None:
         """A frame from a robot (or, by the way SELF, from the broker): decide, move, count, tell the bus.
 
-        Returns its verdict; None while it waits.
+        Returns its verdict; None while it waits, for at most `patience_s`.
         """
         account = self.accounts[way.link]
         account.arrived += 1
+        bus = self.bus
         decision = self._route(frame, way, now)
         hops = decision.hops
         if decision.action == "forward" and len(hops) == 1:
             hop = hops[0]
-            verdict = self.links[hop.link].offer(frame, hop.peer, way, now)
+            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, patience_s)
         else:
             verdict = self._carry_out(decision, frame, way, now)
         if verdict is not None:
             account.fates[verdict] += 1
-            if self._bus.tapped:
-                self._bus.publish_raw(frame, way, verdict)
-        if self._bus.listened and verdict is not DUPLICATE:
-            self._bus.publish(frame, way)
+            if bus.raw_listened:
+                self._tap("in", way, verdict, frame)
+        if bus.listened and verdict is not DUPLICATE:
+            bus.publish(frame, way, self._wall_clock())
         return verdict
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         account = self.accounts[way.link]
         account.arrived += 1
         account.fates[MALFORMED] += 1
-        if self._bus.tapped:
-            self._bus.publish_raw(malformed, way, MALFORMED)
+        if self.bus.raw_listened:
+            self._tap("in", way, MALFORMED, malformed)
         self.resident.malformed(malformed, way, now)
 
-    def send(self, frame: Frame, now: float) -> Verdict | None:
-        """Send a frame of the broker's own; its verdict, or None while it waits."""
-        return self.heard(frame, SELF, now)
+    def send(self, frame: Frame, now: float, patience_s: float = inf) -> Verdict | None:
+        """Send a frame of the broker's own; its verdict, or None while it waits, for at most `patience_s`.
+
+        What waits and is dropped after all is told to `Resident.undelivered`.
+        """
+        return self.heard(frame, SELF, now, patience_s)
+
+    def send_on(self, link: Link, frame: Frame, now: float) -> None:
+        """Send a frame of the broker's own to every far end of one link, whatever the routes say."""
+        self._send_by(link.ways(), frame, now)
+
+    def ask_for(self, robot: Address, now: float) -> None:
+        """Ask for a robot by its name on every link where it may hear its name."""
+        hops = self.router.decide(robot, "psiu-ascii", SELF).hops
+        self._send_by(hops, psiu_ascii.message(self._own_name, robot, "qualseunome"), now)
 
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None:
         final = fate.settle(verdict)
         if final is not None:
             self.accounts[fate.arrived.link].fates[final] += 1
-            if self._bus.tapped:
-                self._bus.publish_raw(fate.frame, fate.arrived, final)
+            if self.bus.raw_listened:
+                self._tap("in", fate.arrived, final, fate.frame)
+            if final is not DELIVERED and fate.arrived is SELF:
+                self.resident.undelivered(fate.frame, final)
+
+    def sent(self, frame: Frame, wire: bytes, way: Way) -> None:
+        self._tap("out", way, DELIVERED, frame._replace(wire=wire))
 
     def opened(self, link: Link, now: float) -> None:
         self.router.link_up(self._ports[link.name])
         self.resident.link_opened(link, now)
 
     def closed(self, link: Link, now: float) -> None:
-        self.router.link_down(link.name, now)
+        self._withdraw(self.router.link_down(link.name, now))
         self.resident.link_closed(link, now)
 
     def peer_lost(self, way: Way, now: float) -> None:
-        self.router.peer_lost(way, now)
+        self._withdraw(self.router.peer_lost(way, now))
 
     def release(self, robot: Address, now: float) -> None:
         """`robot` has been heard: move the frames that waited for it."""
         for held in self.holding.release(robot):
             decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
-            verdict = (
-                NO_ROUTE if decision.action == "ask" else self._carry_out(decision, held.frame, held.arrived, now)
-            )
+            verdict = NO_ROUTE if decision.action == "ask" else self._carry_out(decision, held.frame, held.arrived, now)
             if verdict is not None:
                 self.settled(Fate(held.frame, held.arrived), verdict, now)
 
     def expire(self, now: float) -> None:
-        """Drop what has waited too long, here and in the outboxes."""
+        """Drop what has waited too long, here and in the outboxes, and the routes that grew too old."""
         for held in self.holding.expire(now):
             self.settled(Fate(held.frame, held.arrived), NO_ROUTE, now)
         for link in self.links.values():
             link.expire(now)
+        self._withdraw(self.router.table.age(self._route_age_s, now))
 
     def waiting(self) -> dict[str, int]:
         """How many of the frames that arrived on each link wait now, in an outbox or for a route."""
@@ -157,6 +199,30 @@ class Exchange:
         for fate in fates.values():
             counts[fate.arrived.link] += 1
         return counts
+
+    def _withdraw(self, routes: Iterable[Route]) -> None:
+        for route in routes:
+            self.withdrawn(route)
+
+    def _tap(self, direction: Literal["in", "out"], way: Way, verdict: Verdict, what: Frame | Malformed) -> None:
+        if not self.bus.tapped(way.link):
+            return
+        frame = what if isinstance(what, Frame) else None
+        self.bus.publish_raw(
+            RawFrame(
+                direction=direction,
+                broker=str(self._own_name),
+                link=way.link,
+                peer=peer_text(way.peer),
+                source=str(frame.source) if frame else None,
+                destination=str(frame.destination) if frame else None,
+                subject=frame.subject if frame else None,
+                verdict=verdict,
+                detail=(frame.remark if frame else cast(Malformed, what).reason) or None,
+                received=datetime.fromtimestamp(self._wall_clock(), UTC),
+                wire=what.wire.hex(),
+            )
+        )
 
     def _carry_out(self, decision: Decision, frame: Frame, way: Way, now: float) -> Verdict | None:
         match decision.action:
@@ -187,7 +253,7 @@ class Exchange:
         fate = Fate(frame, way, len(hops))
         final: Verdict | None = None
         for hop in hops:
-            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, fate)
+            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, fate=fate)
             if verdict is not None:
                 final = fate.settle(verdict)
         return final
@@ -200,10 +266,14 @@ class Exchange:
         if not self.holding.add(frame, way, now):
             return NO_ROUTE
         if not asked:
-            question = psiu_ascii.message(self._own_name, frame.destination, "qualseunome")
-            account = self.accounts[SELF.link]
-            account.arrived += 1
-            verdict = self._spread(question, hops, SELF, now)
-            if verdict is not None:
-                account.fates[verdict] += 1
+            self._send_by(hops, psiu_ascii.message(self._own_name, frame.destination, "qualseunome"), now)
         return None
+
+    def _send_by(self, hops: tuple[Way, ...], frame: Frame, now: float) -> None:
+        account = self.accounts[SELF.link]
+        account.arrived += 1
+        verdict = self._spread(frame, hops, SELF, now) if hops else NO_ROUTE
+        if verdict is not None:
+            account.fates[verdict] += 1
+        if self.bus.listened:
+            self.bus.publish(frame, SELF, self._wall_clock())

@@ -91,8 +91,11 @@ class Way(NamedTuple):
     peer: object = None
 
     def __str__(self) -> str:
-        if self.peer is None:
-            return self.link
-        peer = self.peer
-        text = ":".join(str(part) for part in peer) if isinstance(peer, tuple) else str(peer)
-        return f"{self.link}/{text}"
+        return self.link if self.peer is None else f"{self.link}/{peer_text(self.peer)}"
+
+
+def peer_text(peer: object) -> str | None:
+    """A far end in words, as ``host:port`` over UDP; None where a link has only one."""
+    if peer is None:
+        return None
+    return ":".join(str(part) for part in peer) if isinstance(peer, tuple) else str(peer)

@@ -10,11 +10,13 @@ import logging
 import random
 import time
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Final, Literal, Protocol
 
-from psiu_broker.adapter import Adapter, Peer, Transport
+from psiu_broker.adapter import Peer, Transport
 from psiu_broker.codecs.codec import Codec, Event
-from psiu_broker.errors import EncodeError, LinkError, LinkLost
+from psiu_broker.config import LinkConfiguration
+from psiu_broker.errors import EncodeError, LinkError
 from psiu_broker.frame import Frame, Malformed, Way
 from psiu_broker.routing.askers import Askers
 from psiu_broker.routing.outbox import Fate, Outbox, Parcel, lane
@@ -30,9 +32,18 @@ SHORTEST_PAUSE_S: Final = 0.05
 log = logging.getLogger(__name__)
 
 
+class Tap(Protocol):
+    raw_listened: bool
+
+
 class Hub(Protocol):
     """Where links meet: the broker's side of each of them. None of these waits or raises."""
 
+    @property
+    def bus(self) -> Tap:
+        """Tells whether anybody wants to hear of what is `sent`."""
+
+    def sent(self, frame: Frame, wire: bytes, way: Way) -> None: ...
     def heard(self, frame: Frame, way: Way, now: float) -> object: ...
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None: ...
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None: ...
@@ -58,18 +69,16 @@ class Link:
 
     def __init__(
         self,
-        name: str,
-        adapter: Adapter,
+        configuration: LinkConfiguration,
         codec: Callable[[], Codec],
         hub: Hub,
         *,
-        queue_frames: int = 64,
-        max_age_s: float = 2.0,
         unaddressed: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.name = name
-        self.adapter = adapter
+        self.name = configuration.name
+        self.adapter = configuration.adapter
+        self.configuration = configuration
         self.codec = codec()
         """Encodes what leaves; decodes too where each datagram stands alone."""
         self.state: State = "waiting"
@@ -77,23 +86,23 @@ class Link:
         self.since = clock()
         self.frames_in = self.frames_out = self.malformed = self.opened = 0
         self.last_heard: float | None = None
-        self.outbox = Outbox(queue_frames)
+        self.outbox = Outbox(configuration.options.queue_frames)
         self._askers = Askers() if unaddressed else None
         self._make_codec = codec
         self._hub = hub
-        self._max_age_s = max_age_s
+        self._max_age_s = configuration.options.max_age_s
         self._clock = clock
         self._transport: Transport | None = None
         self._ends: dict[Peer, _End] = {}
         self._lost: asyncio.Future[LinkError] | None = None
         self._empty: asyncio.Event = asyncio.Event()
-        self._pause_s = FIRST_PAUSE_S
+        self.pause_s = FIRST_PAUSE_S
 
     # What the transport tells us: adapter.Receiver.
 
     def received(self, data: bytes, peer: Peer) -> None:
         now = self._clock()
-        self._pause_s = FIRST_PAUSE_S
+        self.pause_s = FIRST_PAUSE_S
         end = self._ends.get(peer) or self._end(peer)
         codec = end.codec
         events = codec.decode(data, now)
@@ -112,6 +121,8 @@ class Link:
         while self._transport is not None and (parcel := self.outbox.take()) is not None:
             if self._transport.write(parcel.wire, parcel.peer):
                 self.frames_out += 1
+                if self._hub.bus.raw_listened:
+                    self._hub.sent(parcel.fate.frame, parcel.wire, Way(self.name, parcel.peer))
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
                 self.outbox.put_back(parcel)
@@ -133,14 +144,23 @@ class Link:
     def lost(self, error: LinkError) -> None:
         if self._lost is not None and not self._lost.done():
             self._lost.set_result(error)
-            self._down(str(error))
+        self._down(str(error))
+
+    def connected(self, transport: Transport) -> None:
+        """The adapter has opened `transport`: frames may go."""
+        self._transport = transport
+        self.opened += 1
+        self._set_state("open", None)
+        self._hub.opened(self, self._clock())
 
     # What the broker asks of us.
 
-    def offer(self, frame: Frame, peer: Peer, arrived: Way, now: float, fate: Fate | None = None) -> Verdict | None:
-        """Send `frame` to `peer`, or queue it; never waits.
+    def offer(
+        self, frame: Frame, peer: Peer, arrived: Way, now: float, patience_s: float = inf, fate: Fate | None = None
+    ) -> Verdict | None:
+        """Send `frame` to `peer`, or queue it for at most `patience_s` and the link's own age limit.
 
-        Returns its verdict; None if it waits, in which case `Hub.settled` will be told.
+        Never waits. Returns the verdict; None if the frame is queued, and then `Hub.settled` will be told.
         """
         transport = self._transport
         if transport is None:
@@ -157,10 +177,12 @@ class Link:
             self._askers.note(frame.destination, frame.source, now)
         if not self.outbox.size and transport.write(wire, peer):
             self.frames_out += 1
+            if self._hub.bus.raw_listened:
+                self._hub.sent(frame, wire, Way(self.name, peer))
             return DELIVERED
         if self._transport is None:
             return LINK_DOWN
-        parcel = Parcel(wire, peer, lane(frame), now + self._max_age_s, fate or Fate(frame, arrived))
+        parcel = Parcel(wire, peer, lane(frame), now + min(self._max_age_s, patience_s), fate or Fate(frame, arrived))
         evicted = self.outbox.put(parcel)
         self._empty.clear()
         if evicted is parcel:
@@ -200,7 +222,7 @@ class Link:
                 else:
                     try:
                         if not self._lost.done():
-                            self._up(transport)
+                            self.connected(transport)
                         await self._lost
                     finally:
                         self._down("closed")
@@ -221,14 +243,15 @@ class Link:
             if isinstance(event, Frame):
                 self.frames_in += 1
                 self.last_heard = now
-                if self._askers is not None:
-                    asker = self._askers.of(event.source, now)
-                    if asker is not None:
-                        event = event._replace(destination=asker)
-                self._hub.heard(event, way, now)
+                self._hub.heard(event if self._askers is None else self._addressed(event, now), way, now)
             else:
                 self.malformed += 1
                 self._hub.malformed(event, way, now)
+
+    def _addressed(self, frame: Frame, now: float) -> Frame:
+        """`frame` of a link whose packets do not say for whom they are: for who asked last, if anybody did."""
+        asker = self._askers.of(frame.source, now) if self._askers is not None else None
+        return frame if asker is None else frame._replace(destination=asker)
 
     def _end(self, peer: Peer) -> _End:
         codec = self.codec if self.adapter.datagrams else self._make_codec()
@@ -248,12 +271,6 @@ class Link:
             self._watch_silence(end, rest_s)
         else:
             self._take(end.codec.flush(now), end.way, now)
-
-    def _up(self, transport: Transport) -> None:
-        self._transport = transport
-        self.opened += 1
-        self._set_state("open", None)
-        self._hub.opened(self, self._clock())
 
     def _down(self, reason: str) -> None:
         """Forget the connection: nothing of it may reach a robot later."""
@@ -275,8 +292,8 @@ class Link:
 
     async def _pause(self) -> None:
         """Wait before the next attempt: less when the adapter sees something change, longer each time in vain."""
-        pause_s = self._pause_s * random.uniform(0.5, 1.0)  # noqa: S311: jitter, not a secret
-        self._pause_s = min(self._pause_s * 2, LONGEST_PAUSE_S)
+        pause_s = self.pause_s * random.uniform(0.5, 1.0)  # noqa: S311 - jitter is no secret
+        self.pause_s = min(self.pause_s * 2, LONGEST_PAUSE_S)
         changed = asyncio.ensure_future(self.adapter.changed())
         try:
             await asyncio.sleep(SHORTEST_PAUSE_S)

@@ -1,5 +1,3 @@
-from collections.abc import Callable
-
 import pytest
 
 from psiu_broker.frame import EVERYONE, Address, Frame, Way
@@ -177,9 +175,8 @@ def test_words_for_a_robot_of_bytes_are_translated_and_the_other_way_is_refused(
 def test_two_domains_may_use_the_same_number() -> None:
     red, blue = Address.numbered(3, "red"), Address.numbered(3, "blue")
     router = Router({BASE: "psiu-ascii"}, (), identity=lambda frame: (frame.source, frame.destination, frame.payload))
-    for name in ("red", "blue"):
-        ways: Callable[[], tuple[Way, ...]] = lambda name=name: (Way(name),)  # type: ignore[misc]
-        router.link_up(Port(name, "psiu-hexa", ways))
+    router.link_up(Port("red", "psiu-hexa", lambda: (Way("red"),)))
+    router.link_up(Port("blue", "psiu-hexa", lambda: (Way("blue"),)))
     router.route(packet(red, Address.numbered(1, "red")), Way("red"), 0.0)
     router.route(packet(blue, Address.numbered(1, "blue")), Way("blue"), 0.0)
     assert router.decide(red, "psiu-hexa", SELF).hops == (Way("red"),)

@@ -1,0 +1,327 @@
+"""The broker: puts the parts together, starts them, watches them, and stops them."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
+
+from psiu_broker import __version__
+from psiu_broker.bus.calls import Calls
+from psiu_broker.bus.keys import Keys
+from psiu_broker.bus.publisher import Publisher
+from psiu_broker.bus.queries import Queries
+from psiu_broker.bus.session import Session
+from psiu_broker.codecs import CODECS
+from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.identity import identity
+from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.config import Configuration, LinkConfiguration
+from psiu_broker.errors import BusError
+from psiu_broker.exchange import Exchange, NoBus
+from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.link import Link
+from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Why
+from psiu_broker.messages import Link as LinkMessage
+from psiu_broker.profiles import Node, describe
+from psiu_broker.report import Report
+from psiu_broker.resident import DISCOVER, Resident
+from psiu_broker.routing import table
+from psiu_broker.routing.router import Router
+
+log = logging.getLogger(__name__)
+
+TICK_S: Final = 0.1
+"""How often what is too late is dropped and cards that changed are put."""
+DRAIN_S: Final = 1.0
+"""How long a stopping broker lets its outboxes empty."""
+REOPEN_S: Final = 2.0
+ROUND_TRIP_S: Final = 2.0
+
+
+class Broker:
+    """One broker. `start`, then `stop`; what programs ask of it in between comes by the bus."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self.configuration = configuration
+        self.started = time.time()
+        self._own_name = Address.named(configuration.broker.name)
+        self._directories: dict[str, Directory] = {}
+        bindings = tuple(
+            table.Binding(Address.named(robot.name), robot.address, Way(robot.link, robot.peer), robot.protocol)
+            for robot in configuration.robots.values()
+        )
+        router = Router(self._own_addresses(), bindings, identity, heard=self._robot_heard)
+        self.exchange = Exchange(self._own_name, router)
+        self.resident = self.exchange.resident = Resident(configuration, self.exchange)
+        self.exchange.withdrawn = self._robot_gone
+        self.report = Report(configuration.broker.name, self.exchange, self.resident.commands)
+        for link in configuration.links.values():
+            self.exchange.add(self._link(link))
+        for robot in router.robots():
+            self._list(robot)
+        self._changed: dict[Address, table.Route] = {}
+        self._seen: dict[str, float] = {}
+        self._ticked = time.monotonic()
+        self._bus: _Bus | None = None
+        self._bus_lost = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._link_tasks: list[asyncio.Task[None]] = []
+
+    async def start(self) -> None:
+        """Open the bus and begin to open the links; returns when the core runs, whatever the links do.
+
+        Raises:
+            BusError: the bus cannot open: an endpoint in `zenoh.listen` is taken or not ours.
+        """
+        await self._open_bus()
+        create = asyncio.get_running_loop().create_task
+        self._tasks = [create(self._tick(), name="tick"), create(self._keep_bus(), name="bus")]
+        self._link_tasks = [create(link.run(), name=f"link {link.name}") for link in self.exchange.links.values()]
+
+    async def stop(self) -> None:
+        """Refuse new calls, let what waits go out, close the links, then the bus."""
+        if self._bus is not None:
+            await self._bus.calls.close()
+        await self.resident.close()
+        try:
+            async with asyncio.timeout(DRAIN_S):
+                await asyncio.gather(*(link.drained() for link in self.exchange.links.values()))
+        except TimeoutError:
+            log.warning("stopping with frames still waiting; they are dropped")
+        for task in (*self._link_tasks, *self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._link_tasks, *self._tasks, return_exceptions=True)
+        if self._bus is not None:
+            self.exchange.bus = NoBus()
+            await self._bus.session.close()
+
+    async def healthy(self) -> bool:
+        """Whether everything makes progress: the loop's ticks, every link's life, and the bus, asked through Zenoh."""
+        return (await self._health()).healthy
+
+    # queries.Source
+
+    def status(self) -> Status:
+        links = self.exchange.links.values()
+        return Status(
+            broker=self.configuration.broker.name,
+            version=__version__,
+            started=self.report.moment(time.monotonic() - (time.time() - self.started)),
+            uptime_s=round(time.time() - self.started, 3),
+            links_open=sum(link.state == "open" for link in links),
+            links=len(links),
+            robots=len(self.exchange.router.robots()),
+            zenoh_id=self._bus.session.zenoh_id if self._bus else "",
+            listen=list(self.configuration.zenoh.listen),
+        )
+
+    def links(self) -> Sequence[LinkMessage]:
+        return self.report.links()
+
+    def routes(self) -> Sequence[Route]:
+        return self.report.routes()
+
+    def ledger(self) -> Ledger:
+        return self.report.ledger()
+
+    def health(self) -> Health:
+        checks = self._checks()
+        return Health(healthy=all(checks.values()), checks=checks)
+
+    def config(self) -> Mapping[str, Any]:
+        configuration = self.configuration
+        return {
+            "broker": configuration.broker.model_dump(mode="json"),
+            "zenoh": configuration.zenoh.model_dump(mode="json"),
+            "links": {name: _link_table(link) for name, link in configuration.links.items()},
+            "robots": {
+                robot.name: {
+                    "link": robot.link,
+                    "address": None if robot.address is None else robot.address.number,
+                    "nodes": {name: node.model_dump(mode="json") for name, node in robot.nodes.items()},
+                }
+                for robot in configuration.robots.values()
+            },
+        }
+
+    def why(self, a: Address, b: Address) -> Why:
+        return self.report.why(a, b)
+
+    def cards(self) -> Mapping[Address, Card]:
+        return self.report.cards()
+
+    # Inside: robots come and go.
+
+    def _note(self, routes: Iterable[table.Route]) -> None:
+        """Their cards may have changed."""
+        self._changed.update({route.robot: route for route in routes})
+
+    def _robot_heard(self, route: table.Route) -> None:
+        self._list(route)
+        self._changed[route.robot] = route
+        self.resident.robot_heard(route)
+        for address in route.addresses:
+            self.exchange.release(address, time.monotonic())
+
+    def _robot_gone(self, route: table.Route) -> None:
+        self._changed.pop(route.robot, None)
+        self.resident.robot_gone(route)
+        for address in route.addresses:
+            directory = self._directory(address.domain)
+            directory.names.discard(address.name)
+            directory.numbers.discard(address.number)
+        if self._bus is not None:
+            self._bus.publisher.withdraw_card(route.robot)
+
+    def _list(self, route: table.Route) -> None:
+        for address in route.addresses:
+            directory = self._directory(address.domain)
+            if address.is_numbered:
+                directory.numbers.add(address.number)
+            else:
+                directory.names.add(address.name)
+
+    # Inside: putting together.
+
+    def _own_addresses(self) -> dict[Address, str]:
+        own = {self._own_name: "psiu-ascii"}
+        for link in self.configuration.links.values():
+            if isinstance(link.codec, PsiuHexa.Options):
+                for number in (self.configuration.broker.address, link.codec.local):
+                    own[Address.numbered(number, link.codec.domain)] = "psiu-hexa"
+        return own
+
+    def _directory(self, domain: str) -> Directory:
+        directory = self._directories.get(domain)
+        if directory is None:
+            directory = Directory({str(self._own_name)}, {self.configuration.broker.address})
+            self._directories[domain] = directory
+        return directory
+
+    def _link(self, configuration: LinkConfiguration) -> Link:
+        options = configuration.codec
+        domain = options.domain if isinstance(options, PsiuHexa.Options) else ""
+        unaddressed = isinstance(options, PsiuHexa.Options) and options.topology != "ad-hoc"
+        codec = CODECS[configuration.protocol]
+        directory = self._directory(domain)
+        return Link(configuration, lambda: codec(options, directory), self.exchange, unaddressed=unaddressed)
+
+    # Inside: the bus.
+
+    async def _open_bus(self) -> None:
+        self._bus = await _Bus.open(self, self._bus_lost.set)
+        self.exchange.bus = self._bus.publisher
+        self._note(self.exchange.router.robots())
+
+    async def _keep_bus(self) -> None:
+        """Open another session when Zenoh lost the one we had."""
+        while True:
+            await self._bus_lost.wait()
+            self._bus_lost.clear()
+            self.exchange.bus = NoBus()
+            lost, self._bus = self._bus, None
+            while self._bus is None:
+                if lost is not None:
+                    await lost.calls.close()
+                    await lost.session.close()
+                    lost = None
+                try:
+                    await self._open_bus()
+                except BusError as error:
+                    log.error("the bus cannot be opened again: %s; trying on", error)
+                    await asyncio.sleep(REOPEN_S)
+
+    async def _tick(self) -> None:
+        while True:
+            now = time.monotonic()
+            self._ticked = now
+            self.exchange.expire(now)
+            for link in self.exchange.links.values():
+                if self._seen.get(link.name) != link.since:
+                    self._seen[link.name] = link.since
+                    self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
+            if self._bus is not None:
+                for route in self._changed.values():
+                    self._bus.publisher.publish_card(route.robot, self.report.card(route))
+                self._changed.clear()
+            await asyncio.sleep(TICK_S)
+
+    def _checks(self) -> dict[str, bool]:
+        links = {f"link {task.get_name()}": not task.done() for task in self._link_tasks}
+        return {
+            "loop": time.monotonic() - self._ticked < 10 * TICK_S + ROUND_TRIP_S,
+            "bus": self._bus is not None and not self._bus.session.is_lost,
+            "ledger": self.report.ledger().balances,
+            **links,
+        }
+
+    async def _health(self) -> Health:
+        checks = self._checks()
+        try:
+            checks["zenoh round trip"] = (
+                self._bus is not None and await self._bus.queries.round_trip(ROUND_TRIP_S) < ROUND_TRIP_S
+            )
+        except BusError as error:
+            log.error("health: %s", error)
+            checks["zenoh round trip"] = False
+        if not all(checks.values()):
+            log.error("not healthy: %s", ", ".join(name for name, good in checks.items() if not good))
+        return Health(healthy=all(checks.values()), checks=checks)
+
+    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
+        answer = await self.resident.call(robot, command, request)
+        self._note(self.exchange.router.robots() if command == DISCOVER else ())
+        return answer
+
+    async def send(self, robot: Address, command: str, request: CallRequest) -> None:
+        await self.resident.tell(robot, command, request)
+
+
+class _Bus:
+    """One session with everything that is declared on it."""
+
+    def __init__(self, session: Session, publisher: Publisher, calls: Calls, queries: Queries) -> None:
+        self.session = session
+        self.publisher = publisher
+        self.calls = calls
+        self.queries = queries
+
+    @classmethod
+    async def open(cls, broker: Broker, lost: Callable[[], None]) -> "_Bus":
+        """Raises BusError."""
+        zenoh = broker.configuration.zenoh
+        name = broker.configuration.broker.name
+        keys = Keys(zenoh.prefix)
+        session = await Session.open(zenoh.listen, zenoh.connect, lost=lambda _: lost())
+        try:
+            return cls(
+                session,
+                await Publisher.open(session, keys, name, _describer(broker.configuration)),
+                await Calls.open(session, keys, broker.call, broker.send),
+                await Queries.open(session, keys, name, broker),
+            )
+        except BusError:
+            await session.close()
+            raise
+
+
+def _describer(configuration: Configuration) -> Callable[[Frame], Mapping[str, Any]]:
+    """How to say a frame in words, with the names that the configuration gives to nodes."""
+    named: dict[Address, dict[int, tuple[str, Node]]] = {
+        robot.address: {node.node: (name, node) for name, node in robot.nodes.items()}
+        for robot in configuration.robots.values()
+        if robot.address is not None
+    }
+    nothing: dict[int, tuple[str, Node]] = {}
+    return lambda frame: describe(frame, lambda address: named.get(address, nothing))
+
+
+def _link_table(link: LinkConfiguration) -> dict[str, Any]:
+    return {
+        "adapter": link.adapter_name,
+        "protocol": link.protocol,
+        **link.adapter.model_dump(mode="json"),
+        **link.codec.model_dump(mode="json"),
+        **link.options.model_dump(mode="json"),
+    }

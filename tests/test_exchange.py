@@ -1,0 +1,375 @@
+"""The exchange with real links, routes and codecs; only the far ends are lists."""
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.codecs.identity import identity
+from psiu_broker.errors import LinkLost
+from psiu_broker.exchange import Exchange
+from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way
+from psiu_broker.link import Link
+from psiu_broker.messages import RawFrame
+from psiu_broker.routing.router import SELF, Router
+from psiu_broker.routing.table import Binding, Route
+from psiu_broker.routing.verdicts import ANSWERED, Verdict
+
+BASE = Address.named("base")
+ROBOTS = tuple(Address.named(name) for name in ("PC", "MNERIM", "OUTRO", "base", "??", "ROBO UM"))
+PEERS = (("127.0.0.1", 9001), ("127.0.0.1", 9002))
+
+
+class Resident:
+    """Answers nothing, counts everything; translates by saying that it did."""
+
+    def __init__(self) -> None:
+        self.answered: list[Frame] = []
+        self.translated: list[Frame] = []
+        self.undelivered_frames: list[tuple[Frame, Verdict]] = []
+
+    def answer(self, frame: Frame, way: Way, now: float) -> None:
+        self.answered.append(frame)
+
+    def translate(self, frame: Frame, way: Way, now: float) -> Verdict:
+        self.translated.append(frame)
+        return ANSWERED
+
+    def malformed(self, malformed: Malformed, way: Way, now: float) -> None: ...
+    def undelivered(self, frame: Frame, verdict: Verdict) -> None:
+        self.undelivered_frames.append((frame, verdict))
+
+    def link_opened(self, link: Link, now: float) -> None: ...
+    def link_closed(self, link: Link, now: float) -> None: ...
+
+
+class Bus:
+    """Listens to everything."""
+
+    listened = raw_listened = True
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.raw: list[RawFrame] = []
+
+    def publish(self, frame: Frame, way: Way, received: float) -> None:
+        self.frames.append(frame)
+
+    def tapped(self, link: str) -> bool:
+        return True
+
+    def publish_raw(self, raw: RawFrame) -> None:
+        self.raw.append(raw)
+
+
+class QuietLink(Link):
+    """A link whose silences come when the test says so."""
+
+    def _watch_silence(self, end: object, silence_s: float) -> None: ...
+
+    def fall_silent(self) -> None:
+        for end in list(self._ends.values()):
+            self._silence(end)
+
+
+class World:
+    """An exchange with a radio, a UDP link with two peers, a second radio, and an arm that speaks bytes."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        arm = Address.numbered(0x12)
+        bindings = (Binding(Address.named("BRACO"), arm, Way("arm"), "psiu-hexa"),)
+        own = {BASE: "psiu-ascii", Address.numbered(0): "psiu-hexa"}
+        router = Router(own, bindings, identity, heard=self._heard)
+        self.exchange = Exchange(BASE, router)
+        self.resident = self.exchange.resident = Resident()
+        self.links: dict[str, QuietLink] = {}
+        self._add("radio", MemoryAdapter())
+        self._add("wifi", MemoryDatagrams(ends=PEERS))
+        self._add("second", MemoryAdapter())
+        self._add("arm", MemoryAdapter(), "psiu-hexa", topology="point-to-point", remote=0x12, local=0)
+        self.transports: dict[str, MemoryTransport] = {}
+
+    def _add(self, name: str, adapter: MemoryAdapter, protocol: str = "psiu-ascii", **codec: object) -> None:
+        made = configuration(name, protocol, adapter, codec, queue_frames=3, max_age_s=2.0, route_age_s=30.0)
+        unaddressed = "topology" in codec
+        self.links[name] = QuietLink(
+            made, lambda: codec_of(made), self.exchange, unaddressed=unaddressed, clock=lambda: self.now
+        )
+        self.exchange.add(self.links[name])
+
+    def _heard(self, route: Route) -> None:
+        for address in route.addresses:
+            self.exchange.release(address, self.now)
+
+    def connect(self, *names: str) -> None:
+        for name in names:
+            peers = PEERS if name == "wifi" else (None,)
+            self.transports[name] = MemoryTransport(peers)
+            self.links[name].connected(self.transports[name])
+
+    def wires(self, name: str) -> list[bytes]:
+        return self.transports[name].wires
+
+    def verdicts(self, link: str) -> dict[str, int]:
+        return {verdict: count for verdict, count in self.exchange.accounts[link].fates.items() if count}
+
+    def balances(self) -> None:
+        waiting = self.exchange.waiting()
+        for name, account in self.exchange.accounts.items():
+            assert account.arrived == account.settled() + waiting[name], name
+
+
+def wire(source: str, destination: str, *words: str) -> bytes:
+    frame = psiu_ascii.message(Address.named(source), Address.named(destination), *words)
+    return codec_of(configuration()).encode(frame)
+
+
+def arm_says(payload: bytes) -> bytes:
+    """What the robot at the far end of the point-to-point link puts on the wire."""
+    far_end = configuration("arm", "psiu-hexa", codec={"topology": "point-to-point", "remote": 0, "local": 0x12})
+    return codec_of(far_end).encode(psiu_hexa.packet(Address.numbered(0x12), Address.numbered(0), payload))
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.connect("radio", "wifi", "second", "arm")
+    return world
+
+
+def test_a_command_crosses_from_udp_to_a_radio_unchanged(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    command = wire("PC", "MNERIM", "parafrente", "100")
+    world.links["wifi"].received(command, PEERS[0])
+    assert world.wires("radio") == [command]
+    assert world.verdicts("wifi") == {"delivered": 1}
+    world.balances()
+
+
+def test_a_frame_with_a_wrong_size_is_forwarded_with_the_true_one(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.links["wifi"].received(b"MNERIM 131 parafrente 100 PC 02121", PEERS[0])
+    assert world.wires("radio") == [b"MNERIM 034 parafrente 100 PC 02123"]
+
+
+def test_the_answer_goes_to_the_peer_that_asked_and_to_no_other(world: World) -> None:
+    world.links["wifi"].received(wire("PC", "base", "qualseunome"), PEERS[0])
+    world.links["wifi"].received(wire("OUTRO", "base", "qualseunome"), PEERS[1])
+    answer = wire("MNERIM", "PC", "parafrente", "sucesso")
+    world.links["radio"].received(answer, None)
+    assert world.transports["wifi"].written == [(answer, PEERS[0])]
+
+
+def test_a_frame_for_an_unknown_robot_waits_while_the_robot_is_asked_for(world: World) -> None:
+    command = wire("PC", "MNERIM", "parafrente", "100")
+    world.links["wifi"].received(command, PEERS[0])
+    world.links["wifi"].received(wire("PC", "MNERIM", "paratras", "1"), PEERS[0])
+    question = wire("base", "MNERIM", "qualseunome")
+    assert world.wires("radio") == world.wires("second") == [question], "asked once, by name"
+    world.balances()
+    world.links["second"].received(wire("MNERIM", "base", "qualseunome"), None)
+    assert world.wires("second") == [question, command, wire("PC", "MNERIM", "paratras", "1")]
+    assert world.wires("radio") == [question]
+    assert world.verdicts("wifi") == {"delivered": 2}
+    world.balances()
+
+
+def test_a_robot_that_does_not_answer_to_its_name_has_no_route(world: World) -> None:
+    world.links["wifi"].received(wire("PC", "MNERIM", "parafrente", "100"), PEERS[0])
+    world.exchange.expire(world.now + 0.6)
+    assert world.verdicts("wifi") == {"no_route": 1}
+    world.balances()
+
+
+def test_a_question_to_everyone_goes_to_all_others_and_is_answered_here_too(world: World) -> None:
+    question = wire("PC", "??", "qualseunome")
+    world.links["wifi"].received(question, PEERS[0])
+    assert world.wires("radio") == world.wires("second") == [question]
+    assert world.transports["wifi"].written == [(question, PEERS[1])]
+    assert world.wires("arm") == []
+    assert [frame.destination for frame in world.resident.answered] == [EVERYONE]
+    assert world.verdicts("wifi") == {"delivered": 1}
+
+
+def test_a_robot_heard_on_two_radios_is_heard_once(world: World) -> None:
+    world.links["wifi"].received(wire("PC", "base", "qualseunome"), PEERS[0])
+    answer = wire("MNERIM", "PC", "parafrente", "sucesso")
+    world.links["radio"].received(answer, None)
+    world.links["second"].received(answer, None)
+    assert world.transports["wifi"].wires == [answer]
+    assert world.verdicts("second") == {"duplicate": 1}
+    world.now += 0.2
+    world.links["radio"].received(answer, None)
+    assert world.transports["wifi"].wires == [answer, answer], "a real repeat passes"
+    world.balances()
+
+
+def test_what_the_broker_sent_and_hears_again_does_not_go_round(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    command = psiu_ascii.message(BASE, Address.named("MNERIM"), "parafrente", "1")
+    assert world.exchange.send(command, world.now) == "delivered"
+    world.links["second"].received(wire("base", "MNERIM", "parafrente", "1"), None)
+    assert world.wires("radio") == [wire("base", "MNERIM", "parafrente", "1")]
+    assert world.verdicts("second") == {"duplicate": 1}
+    world.now += 5
+    world.links["second"].received(wire("base", "MNERIM", "parafrente", "1"), None)
+    assert world.verdicts("second") == {"duplicate": 1, "refused": 1}
+
+
+def test_bytes_travel_between_links_of_different_topologies_and_back_to_the_asker() -> None:
+    world = World()
+    world._add("field", MemoryAdapter(), "psiu-hexa", topology="ad-hoc")
+    world.connect("arm", "field")
+    plain = codec_of(configuration(protocol="psiu-hexa"))
+    one, arm = Address.numbered(1), Address.numbered(0x12)
+    world.links["field"].received(plain.encode(psiu_hexa.packet(one, arm, bytes((4, 0x7F)))), None)
+    assert world.wires("arm") == [bytes.fromhex("06047f") + world.wires("arm")[0][3:]]
+    world.links["arm"].received(arm_says(b"A"), None)
+    assert world.wires("field") == [plain.encode(psiu_hexa.packet(arm, one, b"A"))]
+    world.balances()
+
+
+def test_words_for_a_robot_of_bytes_are_translated(world: World) -> None:
+    world.links["wifi"].received(wire("PC", "BRACO", "garra", "45"), PEERS[0])
+    assert [frame.subject for frame in world.resident.translated] == ["garra"]
+    assert world.verdicts("wifi") == {"answered": 1}
+
+
+def test_noise_is_counted(world: World) -> None:
+    world.links["wifi"].received(b"\x00\xff noise", PEERS[0])
+    assert world.verdicts("wifi") == {"malformed": 1}
+    world.balances()
+
+
+def test_what_waited_for_a_lost_link_is_told_to_whoever_sent_it(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.transports["radio"].full = True
+    command = psiu_ascii.message(BASE, Address.named("MNERIM"), "parafrente", "1")
+    assert world.exchange.send(command, world.now) is None
+    world.balances()
+    world.links["radio"].lost(LinkLost("unplugged"))
+    assert world.resident.undelivered_frames == [(command, "link_down")]
+    world.balances()
+
+
+def test_listeners_hear_each_frame_once_and_tappers_hear_every_frame_with_its_verdict(world: World) -> None:
+    bus = world.exchange.bus = Bus()
+    world.links["wifi"].received(wire("PC", "base", "qualseunome"), PEERS[0])
+    answer = wire("MNERIM", "PC", "parafrente", "sucesso")
+    world.links["radio"].received(answer, None)
+    world.links["second"].received(answer, None)
+    world.links["second"].received(b"\x00", None)
+    world.now += 10
+    world.links["second"].fall_silent()
+    assert [frame.subject for frame in bus.frames] == ["qualseunome", "parafrente"]
+    told = [(raw.direction, raw.link, raw.verdict) for raw in bus.raw]
+    assert told == [
+        ("in", "wifi", "answered"),
+        ("out", "wifi", "delivered"),
+        ("in", "radio", "delivered"),
+        ("in", "second", "duplicate"),
+        ("in", "second", "malformed"),
+    ]
+    assert bus.raw[1].wire == bus.raw[2].wire == answer.hex()
+
+
+class FramesAreConserved(RuleBasedStateMachine):
+    """Whatever links, robots and time do: arrived = delivered + answered + dropped + waiting, on every link."""
+
+    names = st.sampled_from(("radio", "wifi", "second", "arm"))
+    robots = st.sampled_from([str(robot) for robot in ROBOTS] + ["BRACO", "GHOST"])
+    words = st.sampled_from(
+        (("qualseunome",), ("parafrente", "100"), ("pare",), ("parafrente", "sucesso"), ("garra", "45"))
+    )
+
+    @initialize()
+    def begin(self) -> None:
+        self.world = World()
+        self.offered = 0
+
+    def _peer(self, name: str, second: bool) -> object:
+        return PEERS[second] if name == "wifi" else None
+
+    @rule(name=names, source=robots, destination=robots, words=words, second=st.booleans())
+    def a_robot_speaks(self, name: str, source: str, destination: str, words: tuple[str, ...], second: bool) -> None:
+        if name != "arm":
+            self._count(
+                lambda: self.world.links[name].received(wire(source, destination, *words), self._peer(name, second))
+            )
+
+    @rule(payload=st.sampled_from((b"", b"A", b"\x04\x7f", b"\x00\x2a")))
+    def the_arm_speaks(self, payload: bytes) -> None:
+        self._count(lambda: self.world.links["arm"].received(arm_says(payload), None))
+
+    @rule(destination=robots, words=words, patience=st.floats(0, 3))
+    def the_broker_speaks(self, destination: str, words: tuple[str, ...], patience: float) -> None:
+        frame = psiu_ascii.message(BASE, Address.named(destination), *words)
+        before = self.world.exchange.accounts[SELF.link].arrived
+        self.world.exchange.send(frame, self.world.now, patience)
+        assert self.world.exchange.accounts[SELF.link].arrived == before + 1
+
+    @rule(name=names, noise=st.binary(max_size=40), second=st.booleans())
+    def noise_arrives(self, name: str, noise: bytes, second: bool) -> None:
+        self.world.links[name].received(noise, self._peer(name, second))
+        self.world.now += 0.3
+        self.world.links[name].fall_silent()
+
+    @rule(name=names)
+    def a_link_comes(self, name: str) -> None:
+        if self.world.links[name].state != "open":
+            self.world.connect(name)
+
+    @rule(name=names)
+    def a_link_goes(self, name: str) -> None:
+        self.world.links[name].lost(LinkLost("unplugged"))
+
+    @rule(second=st.booleans())
+    def a_peer_goes(self, second: bool) -> None:
+        self.world.links["wifi"].peer_lost(PEERS[second])
+
+    @rule(name=names)
+    def a_wire_fills(self, name: str) -> None:
+        if name in self.world.transports:
+            self.world.transports[name].full = True
+
+    @rule(name=names)
+    def a_wire_has_room(self, name: str) -> None:
+        if name in self.world.transports:
+            self.world.transports[name].full = False
+            self.world.links[name].writable()
+
+    @rule(seconds=st.sampled_from((0.1, 0.6, 1.5, 40.0)))
+    def time_passes(self, seconds: float) -> None:
+        self.world.now += seconds
+        self.world.exchange.expire(self.world.now)
+        for link in self.world.links.values():
+            link.fall_silent()
+
+    @invariant()
+    def the_books_balance(self) -> None:
+        self.world.balances()
+
+    @invariant()
+    def nothing_waits_for_a_link_that_is_down(self) -> None:
+        for link in self.world.links.values():
+            assert link.state == "open" or not link.outbox.size
+
+    @invariant()
+    def outboxes_stay_within_their_bounds(self) -> None:
+        assert all(link.outbox.size <= 3 for link in self.world.links.values())
+
+    def _count(self, speak: Callable[[], None]) -> None:
+        """One whole frame arrives: the books show one more arrival, and only what the broker says of it besides."""
+        others = sum(account.arrived for name, account in self.world.exchange.accounts.items() if name != SELF.link)
+        speak()
+        accounts = self.world.exchange.accounts.items()
+        assert sum(account.arrived for name, account in accounts if name != SELF.link) == others + 1
+
+
+TestFramesAreConserved = FramesAreConserved.TestCase
+TestFramesAreConserved.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
