@@ -59,6 +59,8 @@ class _Call:
     begun: float
     deadline: float
     patience_s: float
+    retries: int
+    busy_poll_s: float
     sent: int = 0
     frame: Frame | None = None
     heard: deque[tuple[Reading | CallError, float]] = field(default_factory=deque)
@@ -119,6 +121,8 @@ class Conversations:
         link: str,
         peer: object = None,
         timeout_s: float | None = None,
+        retries: int | None = None,
+        busy_poll_s: float | None = None,
     ) -> Answer:
         """Tell `robot` (at `address`) a command, as `own`, and return its answer within `timeout_s`.
 
@@ -131,13 +135,29 @@ class Conversations:
         begun = asyncio.get_running_loop().time()
         self._refuse_when_closed()
         request = profile.request(command, parameters)
-        tries = 1 + self._retries
+        retries = self._retries if retries is None else retries
+        tries = 1 + retries
         if timeout_s is None:
             patience_s, deadline = request.timeout_s, begun + request.timeout_s * tries
         else:
             patience_s = max(request.timeout_s, timeout_s / tries) if request.question else timeout_s
             deadline = begun + timeout_s
-        call = _Call(robot, own, address, link, peer, profile, request, build, command, begun, deadline, patience_s)
+        call = _Call(
+            robot,
+            own,
+            address,
+            link,
+            peer,
+            profile,
+            request,
+            build,
+            command,
+            begun,
+            deadline,
+            patience_s,
+            retries,
+            busy_poll_s or self._busy_poll_s,
+        )
         async with self._turn(call):
             reply, at = await self._converse(call)
         elapsed_ms = round((at - begun) * 1000, 3)
@@ -250,7 +270,7 @@ class Conversations:
                 raise CallError("impossible", f"{call.robot} says that {call.command} is impossible")
             elif reading is None and not call.request.question:
                 raise _outcome_unknown(call, loop.time())
-            elif tries > self._retries or loop.time() >= call.deadline:
+            elif tries > call.retries or loop.time() >= call.deadline:
                 raise _no_answer(call, tries, understood=reading is None)
 
     async def _after_sending(self, call: _Call, until: float) -> tuple[Reading | None, float]:
@@ -278,11 +298,11 @@ class Conversations:
         """
         loop = asyncio.get_running_loop()
         poll = call.profile.poll
-        next_poll = loop.time() + self._busy_poll_s
+        next_poll = loop.time() + call.busy_poll_s
         asked = False
         while poll is not None and loop.time() < call.deadline:
             if loop.time() >= next_poll:
-                next_poll = loop.time() + self._busy_poll_s
+                next_poll = loop.time() + call.busy_poll_s
                 self._offer(call, poll, min(next_poll, call.deadline))
                 asked = True
             reading, at = await call.next(min(next_poll, call.deadline))

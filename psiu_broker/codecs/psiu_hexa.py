@@ -39,8 +39,10 @@ _COMMANDS: Final = tuple(_NAMED.get(byte, f"command/{byte}") for byte in range(2
 _NODES: Final = tuple(f"node/{node}" for node in range(256))
 _CARRIED: Final = {"ad-hoc": 2, "master-slave": 1, "point-to-point": 0}
 
+BAD_CHECK: Final = "crc"
+"""The reason of a `Malformed` whose check byte was wrong: what a NAK is for."""
+
 _BAD_SIZE: Final = "size"
-_BAD_CHECK: Final = "crc"
 _UNFINISHED: Final = "unfinished"
 _BAD_FRAGMENTS: Final = "fragments"
 
@@ -204,17 +206,16 @@ class PsiuHexa(Codec):
         end = len(buffer)
         while at < end:
             lost = bool(self._reason)
-            if lost and not self._searchable:
-                at = end
-                break
+            if lost:
+                at = self._next_find(buffer, at, closed=closed)
+                if at == end:
+                    break
             reason = _UNFINISHED
             if end - at > carried:
                 size = buffer[at + carried]
                 length = size + beyond
                 if not self._least <= size <= self._most:
                     reason = _BAD_SIZE
-                elif lost and not self._is_known(buffer, at):
-                    pass
                 elif end - at >= length:
                     wire = buffer[at : at + length]
                     if (check is None or check(wire[:-1]) == wire[-1]) and not (lost and self._is_odd(wire)):
@@ -225,7 +226,7 @@ class PsiuHexa(Codec):
                         events += (frame,) if self._reassembly is None else self._joined(self._reassembly, frame, now)
                         at = dropped = at + length
                         continue
-                    reason = _BAD_CHECK
+                    reason = BAD_CHECK
                 elif not closed:
                     break
             elif not closed:
@@ -238,16 +239,21 @@ class PsiuHexa(Codec):
             self._noise.end(self._reason, events)
             self._reason = ""
 
-    @property
-    def _searchable(self) -> bool:
-        return self.options.resync and self._carried > 0
-
-    def _is_known(self, buffer: bytes, at: int) -> bool:
-        """Whether the packet that may begin at `at` is for, or in master-slave from, a robot that is known."""
-        if self._carried == 1:
-            return buffer[at] in self._directory.numbers
-        number = buffer[at + 1]
-        return number in self._directory.numbers or number == self.options.local
+    def _next_find(self, buffer: bytes, at: int, *, closed: bool) -> int:
+        """Where, from `at` on, a packet of a possible size for (or from) a known robot begins, or may yet."""
+        carried, least, most = self._carried, self._least, self._most
+        if not carried or not self.options.resync:
+            return len(buffer)
+        addressed = carried - 1
+        numbers = self._directory.numbers
+        # In master-slave the address is the slave's, so ours says nothing.
+        local = self.options.local if addressed else -1
+        for place in range(at, len(buffer) - carried):
+            if least <= buffer[place + carried] <= most:
+                number = buffer[place + addressed]
+                if number in numbers or number == local:
+                    return place
+        return len(buffer) if closed else max(at, len(buffer) - carried)
 
     def _is_odd(self, wire: bytes) -> bool:
         """Whether a find is a complex packet whose fields do not add up; pieces of a longer message never do."""
