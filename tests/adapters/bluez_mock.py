@@ -203,13 +203,16 @@ def DisconnectProfile(self, uuid):
     note("DisconnectProfile")
 
 
-@dbus.service.method(STEER, in_signature="s", out_signature="s", async_callbacks=("done", "failed"))
-def Call(self, address, done=None, failed=None):
-    """The device of `address` calls us; "rejected" or "connected"."""
+@dbus.service.method(STEER, in_signature="sb", out_signature="s", async_callbacks=("done", "failed"))
+def Call(self, address, trusted, done=None, failed=None):
+    """The device of `address` calls us: "connected", "rejected" or, unless `trusted`, "not authorized"."""
 
     def authorized(*_):
         new_connection(path_of(address), lambda *_: done("connected"), lambda _: done("rejected"))
 
+    if trusted:
+        authorized()
+        return
     service = [dbus.ObjectPath(path_of(address)), "00001101-0000-1000-8000-00805f9b34fb"]
     ask_agent("AuthorizeService", "os", service, authorized, lambda _: done("not authorized"))
 

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Iterator
@@ -46,27 +47,31 @@ needs_mock = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
 
 class Robot:
-    """A robot that is switched on: whoever connects is `joined`."""
+    """A robot that is switched on; whoever connects to it waits until `joined`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._server: asyncio.Server | None = None
-        self._joined: asyncio.Queue[Ends] = asyncio.Queue()
+        self._listening = socket.socket(socket.AF_UNIX)
+        self._writers: list[asyncio.StreamWriter] = []
 
     async def __aenter__(self) -> "Robot":
-        self._server = await asyncio.start_unix_server(lambda *ends: self._joined.put_nowait(ends), self._path)
+        self._listening.setblocking(False)
+        self._listening.bind(str(self._path))
+        self._listening.listen()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        assert self._server is not None
-        self._server.close()
-        self._path.unlink(missing_ok=True)
-        while not self._joined.empty():
-            self._joined.get_nowait()[1].close()
+        self._listening.close()
+        self._path.unlink()
+        for writer in self._writers:
+            writer.close()
 
     async def joined(self) -> Ends:
         async with asyncio.timeout(PATIENCE_S):
-            return await self._joined.get()
+            connection, _ = await asyncio.get_running_loop().sock_accept(self._listening)
+        ends = await asyncio.open_connection(sock=connection)
+        self._writers.append(ends[1])
+        return ends
 
 
 class Bluetooth:

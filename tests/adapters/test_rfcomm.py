@@ -5,10 +5,12 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from adapter_contract import Recorder
-from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, mocked, needs_mock, opened
+from adapter_contract import PATIENCE_S, AdapterContract, FarEnd, Recorder
+from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, Ends, Robot, mocked, needs_mock, opened
+from pydantic import ValidationError
 
 from psiu_adapters.rfcomm import Rfcomm
+from psiu_broker.adapter import Adapter, Transport
 from psiu_broker.errors import LinkAbsent, LinkBusy, LinkLost
 
 pytestmark = needs_mock
@@ -155,3 +157,65 @@ async def test_connecting_waits_while_bluez_reads_the_services(bluetooth: Blueto
         _, writer = await robot.joined()
         writer.close()
     assert (await bluetooth.log()).count("ConnectProfile 00001101") == 2
+
+
+class Connected(FarEnd):
+    """A robot behind the mocked BlueZ; it takes the newest connection."""
+
+    adapter: Adapter = Rfcomm(address=ROBOT)
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._ends: Ends | None = None
+
+    def meet(self, transport: Transport) -> None:
+        self._ends = None
+
+    async def ends(self) -> Ends:
+        if self._ends is None:
+            self._ends = await self._robot.joined()
+        return self._ends
+
+    async def say(self, data: bytes) -> None:
+        (await self.ends())[1].write(data)
+
+    async def heard(self, size: int) -> bytes:
+        async with asyncio.timeout(PATIENCE_S):
+            return await (await self.ends())[0].readexactly(size)
+
+    async def vanish(self) -> None:
+        (await self.ends())[1].transport.abort()
+
+
+class TestContract(AdapterContract):
+    @pytest.fixture
+    async def far(self, bluetooth: Bluetooth) -> AsyncIterator[FarEnd]:
+        await bluetooth.start(known=PAIRED)
+        async with bluetooth.robot() as robot:
+            yield Connected(robot)
+
+    @pytest.fixture
+    async def absent(self, bluetooth: Bluetooth) -> Adapter:
+        await bluetooth.start(known=BOTH)
+        return Rfcomm(address=OTHER)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "give either address"),
+        ({"address": ROBOT, "accept": True}, "give either address"),
+        ({"address": "98:D3:31:00:00"}, "not a Bluetooth address: six hex pairs"),
+        ({"address": ROBOT, "channel": 31}, "less than or equal to 30"),
+        ({"address": ROBOT, "channel": 2, "route": "bluez"}, "BlueZ looks it up"),
+        ({"accept": True, "route": "socket"}, "accept = true needs BlueZ"),
+        ({"address": ROBOT, "controller": "usb0"}, "should match pattern"),
+    ],
+)
+def test_impossible_options_are_told(options: dict[str, object], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        Rfcomm.model_validate(options)
+
+
+def test_an_address_is_written_in_one_way() -> None:
+    assert Rfcomm(address="98:d3:31:00:00:0a").address == "98:D3:31:00:00:0A"

@@ -1,13 +1,15 @@
 """RFCOMM: phones and robots that call us."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from adapter_contract import Recorder, descriptors_become, open_descriptors
-from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, mocked, needs_mock, opened
+from adapter_contract import PATIENCE_S, AdapterContract, FarEnd, Recorder, descriptors_become, open_descriptors
+from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, Ends, Robot, mocked, needs_mock, opened
 
 from psiu_adapters.rfcomm import Rfcomm
+from psiu_broker.adapter import Adapter, Transport
 from psiu_broker.errors import LinkBusy
 
 pytestmark = needs_mock
@@ -31,7 +33,7 @@ async def test_phones_that_call_are_peers_by_their_address(bluetooth: Bluetooth)
         assert transport.write(b"to nobody", ROBOT)
         ends = {}
         for address, phone in ((ROBOT, one), (OTHER, other)):
-            assert await bluetooth.steer("Call", "s", address) == "connected"
+            assert await bluetooth.steer("Call", "sb", address, False) == "connected"
             ends[address] = await phone.joined()
             ends[address][1].write(address.encode())
         await recorder.until(lambda: sorted(recorder.heard) == [(ROBOT.encode(), ROBOT), (OTHER.encode(), OTHER)])
@@ -51,9 +53,9 @@ async def test_a_phone_that_calls_again_replaces_its_dead_call(bluetooth: Blueto
     await bluetooth.start(known=PAIRED)
     recorder = Recorder()
     async with bluetooth.robot() as phone, opened(Rfcomm(accept=True), recorder) as transport:
-        await bluetooth.steer("Call", "s", ROBOT)
+        await bluetooth.steer("Call", "sb", ROBOT, False)
         reader, first = await phone.joined()
-        await bluetooth.steer("Call", "s", ROBOT)
+        await bluetooth.steer("Call", "sb", ROBOT, False)
         _, second = await phone.joined()
         assert await reader.read() == b""
         second.write(b"again")
@@ -67,13 +69,17 @@ async def test_a_phone_that_calls_again_replaces_its_dead_call(bluetooth: Blueto
 async def test_nobody_may_call_when_no_link_accepts(bluetooth: Bluetooth) -> None:
     await bluetooth.start(known=BOTH)
     before = open_descriptors()
-    async with bluetooth.robot(ROBOT) as robot, bluetooth.robot(OTHER) as phone:
-        async with opened(Rfcomm(accept=True), Recorder()) as accepting, opened(Rfcomm(address=ROBOT), Recorder()):
-            _, writer = await robot.joined()
-            await accepting.close()
-            assert await bluetooth.steer("Call", "s", OTHER) == "not authorized"
-            assert phone._joined.empty()
-            writer.close()
+    async with (
+        bluetooth.robot(ROBOT),
+        bluetooth.robot(OTHER) as phone,
+        opened(Rfcomm(accept=True), Recorder()) as accepting,
+        opened(Rfcomm(address=ROBOT), Recorder()),
+    ):
+        await accepting.close()
+        assert await bluetooth.steer("Call", "sb", OTHER, False) == "not authorized"
+        assert await bluetooth.steer("Call", "sb", OTHER, True) == "rejected"
+        reader, _ = await phone.joined()
+        assert await reader.read() == b""
     await descriptors_become(before)
 
 
@@ -87,7 +93,7 @@ async def test_bluetoothd_stopping_is_told_to_a_link_that_accepts(bluetooth: Blu
         assert len(recorder.losses) == 1
     await bluetooth.start(known=PAIRED)
     async with bluetooth.robot() as phone, opened(adapter, Recorder()):
-        assert await bluetooth.steer("Call", "s", ROBOT) == "connected"
+        assert await bluetooth.steer("Call", "sb", ROBOT, False) == "connected"
         (await phone.joined())[1].close()
 
 
@@ -96,3 +102,51 @@ async def test_only_one_link_accepts(bluetooth: Bluetooth) -> None:
     async with opened(Rfcomm(accept=True), Recorder()):
         with pytest.raises(LinkBusy, match="another link of this broker accepts"):
             await Rfcomm(accept=True).open(Recorder())
+
+
+class Caller(FarEnd):
+    """A phone that calls a link that accepts."""
+
+    adapter: Adapter = Rfcomm(accept=True)
+    peer = ROBOT
+
+    def __init__(self, bluetooth: Bluetooth, phone: Robot) -> None:
+        self._bluetooth = bluetooth
+        self._phone = phone
+        self._ends: Ends | None = None
+
+    async def call(self) -> None:
+        assert await self._bluetooth.steer("Call", "sb", ROBOT, False) == "connected"
+
+    async def ends(self) -> Ends:
+        if self._ends is None:
+            self._ends = await self._phone.joined()
+        return self._ends
+
+    async def say(self, data: bytes) -> None:
+        (await self.ends())[1].write(data)
+
+    async def heard(self, size: int) -> bytes:
+        async with asyncio.timeout(PATIENCE_S):
+            return await (await self.ends())[0].readexactly(size)
+
+
+class TestContract(AdapterContract):
+    losable = False  # a phone that vanishes is a lost peer, not a lost link
+
+    async def open(self, far: FarEnd, recorder: Recorder) -> Transport:
+        transport = await super().open(far, recorder)
+        assert isinstance(far, Caller)
+        await far.call()
+        return transport
+
+    @pytest.fixture
+    async def far(self, bluetooth: Bluetooth) -> AsyncIterator[FarEnd]:
+        await bluetooth.start(known=PAIRED)
+        async with bluetooth.robot() as phone:
+            yield Caller(bluetooth, phone)
+
+    @pytest.fixture
+    async def absent(self, bluetooth: Bluetooth) -> Adapter:
+        await bluetooth.start(controller=False)
+        return Rfcomm(accept=True)
