@@ -183,7 +183,6 @@ class DescriptorTransport(Transport):
             return
         self._dead = True
         self._open = False
-        self._rest = b""
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
         if self._timer is not None:

@@ -138,7 +138,6 @@ class _UdpTransport(Transport):
         self._refused = 0
         self._oversized = 0
         self._send_errors = 0
-        self._blocked = False
         self._closed = False
         self._sweeper: asyncio.TimerHandle | None = None
         self._resolver: asyncio.Task[None] | None = None
@@ -172,9 +171,7 @@ class _UdpTransport(Transport):
         try:
             self._sendto(data, entry.address)
         except BlockingIOError:
-            if not self._blocked:
-                self._blocked = True
-                self._loop.add_writer(self._main.fileno(), self._has_room)
+            self._loop.add_writer(self._main.fileno(), self._has_room)
             return False
         except OSError:
             self._send_errors += 1
@@ -212,11 +209,12 @@ class _UdpTransport(Transport):
         known = self._by_address.get
         received = self._receiver.received
         turns = range(DRAIN_DATAGRAMS)
+        too_long = DATAGRAM_BYTES + 1
 
         def read() -> None:
             for _ in turns:
                 try:
-                    data, address = recvfrom(DATAGRAM_BYTES + 1)
+                    data, address = recvfrom(too_long)
                 except BlockingIOError:
                     return
                 except OSError as error:
@@ -230,9 +228,9 @@ class _UdpTransport(Transport):
                     if entry is None:
                         continue
                 entry.silent = 0
-                if len(data) > DATAGRAM_BYTES:
+                if len(data) == too_long:
                     self._oversized += 1
-                    data = data[:DATAGRAM_BYTES]
+                    data = data[:-1]
                 received(data, entry.peer)
 
         return read
@@ -308,7 +306,6 @@ class _UdpTransport(Transport):
         self._add(address, fixed=True)
 
     def _has_room(self) -> None:
-        self._blocked = False
         self._loop.remove_writer(self._main.fileno())
         self._receiver.writable()
 

@@ -6,7 +6,7 @@ import fcntl
 import logging
 import os
 import re
-import select
+import socket
 import sys
 import termios
 import threading
@@ -14,7 +14,9 @@ import time
 import tty
 from asyncio.subprocess import PIPE
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import serial
@@ -75,6 +77,55 @@ class Pty(FarEnd):
 
     async def vanish(self) -> None:
         self.unplug()
+
+
+class FakeUdev(ModuleType):
+    """The part of pyudev that is used, its events told by the test: no udev runs where tests do."""
+
+    def __init__(self) -> None:
+        super().__init__("pyudev")
+        self.ends: list[socket.socket] = []
+        self.Context = object
+        self.Monitor = self
+
+    def from_netlink(self, _context: object, *, source: str) -> "FakeMonitor":
+        assert source == "udev", "the kernel's events come before udev has set owner and links"
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ends.append(ours)
+        return FakeMonitor(theirs)
+
+    def tell(self, action: str, node: str) -> None:
+        for end in self.ends:
+            with suppress(BrokenPipeError):
+                end.send(f"{action} {node}".encode())
+
+    def close(self) -> None:
+        for end in self.ends:
+            end.close()
+
+
+class FakeMonitor:
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        self.end = end
+        self.fileno = end.fileno
+
+    def __del__(self) -> None:
+        self.end.close()
+
+    def filter_by(self, subsystem: str) -> None:
+        assert subsystem == "tty"
+
+    def start(self) -> None:
+        pass
+
+    def poll(self, timeout: float) -> SimpleNamespace | None:
+        assert timeout == 0, "the event loop must not wait"
+        try:
+            action, node = self.end.recv(1000).decode().split()
+        except BlockingIOError:
+            return None
+        return SimpleNamespace(action=action, device_node=node)
 
 
 @pytest.fixture
@@ -174,24 +225,46 @@ class TestUnplugging:
             async with asyncio.timeout(1.3):
                 await Serial(device=str(tmp_path / "nothing")).changed()
 
-    async def test_bytes_stolen_by_another_reader_do_not_look_like_unplugging(
-        self, tmp_path: Path, recorder: Recorder
+    async def test_an_event_of_the_device_is_worth_another_try_at_once(
+        self, pty: Pty, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        far = Pty(tmp_path / "shared", exclusive=False)
-        transport = await far.adapter.open(recorder)
-        thief = os.open(far.link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        for _ in range(50):
-            await far.say(b"mine or yours?")
-            # The event loop has not run, so its wake-up comes to an empty port.
-            select.select([thief], [], [], PATIENCE_S)
-            os.read(thief, 100)
-            await asyncio.sleep(0)
-        await far.say(b"still here")
-        await recorder.until(lambda: b"still here" in recorder.data)
+        udev = FakeUdev()
+        monkeypatch.setitem(sys.modules, "pyudev", udev)
+        monkeypatch.setattr("psiu_adapters.serial.POLL_S", 3600)
+        waiting = asyncio.create_task(pty.adapter.changed())
+        usb = asyncio.create_task(Serial(device="0403:6001").changed())
+        await asyncio.sleep(0)
+        udev.tell("remove", str(pty.link.readlink()))
+        udev.tell("add", "/dev/ttyUSB93")
+        async with asyncio.timeout(PATIENCE_S):
+            await usb
+        assert not waiting.done()
+        udev.tell("change", str(pty.link.readlink()))
+        async with asyncio.timeout(PATIENCE_S):
+            await waiting
+        udev.close()
+
+    async def test_without_pyudev_the_return_is_noticed_by_looking(
+        self, pty: Pty, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "pyudev", None)
+        monkeypatch.setattr("psiu_adapters.serial.POLL_S", 0.02)
+        pty.unplug()
+        waiting = asyncio.create_task(pty.adapter.changed())
+        await asyncio.sleep(0.05)
+        assert not waiting.done()
+        pty.plug_in()
+        async with asyncio.timeout(PATIENCE_S):
+            await waiting
+
+    async def test_a_wake_up_for_nothing_does_not_look_like_unplugging(self, pty: Pty, recorder: Recorder) -> None:
+        transport = await pty.adapter.open(recorder)
+        # As when another program was quicker to read what had come.
+        transport._read()  # type: ignore[attr-defined]
+        await pty.say(b"still here")
+        await recorder.until(lambda: recorder.data == b"still here")
         assert recorder.losses == []
-        os.close(thief)
         await transport.close()
-        far.unplug()
 
 
 class TestOpening:

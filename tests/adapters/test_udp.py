@@ -477,6 +477,26 @@ class TestGroups:
         assert main.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 1
         await transport.close()
 
+    async def test_groups_that_other_programs_joined_are_not_heard(
+        self, member: socket.socket, robot: Robot, recorder: Recorder
+    ) -> None:
+        port = member.getsockname()[1]
+        transport = await Udp(listen=f"0.0.0.0:{port}", reuse=True).open(recorder)
+        index = socket.if_nametoindex("lo")
+        robot.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, struct.pack("@8xi", index))
+        robot.socket.sendto(b"to the group", (GROUP, port))
+        robot.socket.sendto(b"to us", ("127.0.0.1", port))
+        await recorder.until(lambda: recorder.heard)
+        assert recorder.data == b"to us"
+        await transport.close()
+
+    async def test_a_group_that_cannot_be_joined_is_a_link_error_in_one_line(
+        self, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(socket, "IP_ADD_MEMBERSHIP", 9999)
+        with pytest.raises(LinkAbsent, match=r"cannot join the group \(protocol not available\)"):
+            await Udp(listen="127.0.0.1:0", peers=(f"{GROUP}:9",), interface="lo").open(recorder)
+
     async def test_an_interface_that_is_not_there_is_waited_for(self, recorder: Recorder) -> None:
         before = open_descriptors()
         with pytest.raises(LinkAbsent, match="there is no network interface 'wlan93'"):
