@@ -123,6 +123,15 @@ def test_the_position_follows_turns_and_both_directions() -> None:
     assert robot.position == (100, 30, 90)
 
 
+@pytest.mark.parametrize(
+    ("command", "greatest"), [("parafrente", 999), ("paratras", 999), ("giradireita", 360), ("giraesquerda", 360)]
+)
+def test_every_motion_has_the_range_of_the_document(command: str, greatest: int) -> None:
+    robot = AsciiRobot("MNERIM")
+    for amount, word in [(0, "sucesso"), (greatest, "sucesso"), (greatest + 1, "falha")]:
+        assert answers(robot, frame("MNERIM", command, amount)) == [frame("PC", command, word, source="MNERIM")]
+
+
 def test_a_robot_answers_everyone_at_a_random_time_but_its_own_name_at_once() -> None:
     robot = AsciiRobot("MNERIM", wildcard_delay_s=0.05)
     delays = [robot.receive(DISCOVERY, float(n))[0][0] for n in range(100)]

@@ -169,6 +169,20 @@ def test_robots_ask_each_other_without_answering_answers() -> None:
     assert ask(one, 0, 5, source=2) == [bytes([WTF])]
 
 
+def test_an_answer_is_expected_only_once() -> None:
+    sensor, actuator, echo = (HexaRobot(1) for _ in range(3))
+    sensor.node(2, 7)
+    assert ask(sensor, 0, 5, source=2) == []
+    assert ask(sensor, 0, 5, source=2) == [bytes([WTF])]
+    actuator.node(2, 4, 9)
+    assert ask(actuator, ACK, source=2) == []
+    assert ask(actuator, 0, 5, source=2) == [bytes([WTF])]
+    message = complex_payload([b"abc"])
+    echo.packet(2, message)
+    assert ask(echo, *message, source=2) == []
+    assert ask(echo, *message, source=2) == [message]
+
+
 def test_what_it_heard_is_kept_in_words() -> None:
     robot = HexaRobot(2)
     for payload in [(), (AVAILABLE,), (200,), (4, 9), (2, 1, 2, 0xAA, 0xBB, 0xCC)]:

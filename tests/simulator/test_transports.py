@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -102,12 +103,15 @@ async def test_a_robot_on_a_pty_answers_whoever_opens_it(opened: Callable[[str],
         await port.until(lambda: robot.position.x == 100)
 
 
-async def test_every_byte_passes_a_pty_unchanged(opened: Callable[[str], FarEnd]) -> None:
+async def test_every_byte_passes_a_pty_unchanged_even_if_nobody_sets_the_terminal() -> None:
     robot = HexaRobot(2, topology="point-to-point")
     payload = bytes([1, 249]) + bytes(range(249))
     async with PtyPort(robot) as port:
+        end = FarEnd(os.open(port.path, os.O_RDWR | os.O_NOCTTY))
         wire = HexaRobot(1, topology="point-to-point").packet(0, payload)
-        assert await opened(port.path).answer(wire, len(wire)) == wire
+        assert await end.answer(wire, len(wire)) == wire
+        end.close()
+        os.close(end.fd)
 
 
 async def test_unplugging_hangs_up_and_plugging_brings_the_name_back(
@@ -187,6 +191,16 @@ async def test_robots_on_one_line_hear_each_other_and_answer_everyone_in_turn(
         await end.until(lambda: end.received.count(b"parafrente") == 2)
 
 
+async def test_slaves_on_one_line_do_not_take_their_own_answers_for_orders(opened: Callable[[str], FarEnd]) -> None:
+    slaves = [HexaRobot(number, topology="master-slave") for number in (5, 6)]
+    async with PtyPort(*slaves) as port:
+        end = opened(port.path)
+        assert await end.answer(bytes.fromhex("05045d"), 3) == bytes.fromhex("05045d")
+        assert (await end.answer(bytes.fromhex("050603ffff"), 4))[:3] == bytes.fromhex("050541")
+    assert [heard.subject for heard in slaves[0].heard] == ["ping", "node/3"]
+    assert slaves[1].heard == []
+
+
 async def test_faults_act_in_both_directions(opened: Callable[[str], FarEnd]) -> None:
     seen: list[tuple[str, bytes]] = []
     faults = Faults(one_byte_at_a_time=True)
@@ -213,6 +227,16 @@ async def test_jitter_keeps_the_order_of_a_stream(opened: Callable[[str], FarEnd
             port.send(piece)
         await end.until(lambda: len(end.received) == 800)
         assert end.received == b"".join(sent)
+
+
+async def test_a_busy_event_loop_keeps_the_order_of_a_stream(opened: Callable[[str], FarEnd]) -> None:
+    async with PtyPort(AsciiRobot("MNERIM"), faults=Faults(one_byte_at_a_time=True)) as port:
+        end = opened(port.path)
+        port.send(b"ab")
+        time.sleep(0.01)  # noqa: ASYNC251 - the loop is to be late
+        port.send(b"c")
+        await end.until(lambda: len(end.received) == 3)
+        assert end.received == b"abc"
 
 
 async def test_a_robot_on_udp_answers_each_sender(caller: socket.socket) -> None:
@@ -306,13 +330,20 @@ async def test_a_port_without_robots_is_refused() -> None:
         PtyPort()
 
 
-async def test_nothing_happens_after_closing(caller: socket.socket) -> None:
-    robot = AsciiRobot("MNERIM", telemetry_s=0.01)
-    seen: list[bytes] = []
-    port = UdpPort(robot, peer=place(caller), observer=lambda way, data: seen.append(data))
+class Chatterbox(AsciiRobot):
+    spoken = 0
+
+    def telemetry(self) -> bytes:
+        self.spoken += 1
+        return super().telemetry()
+
+
+async def test_nothing_happens_after_closing() -> None:
+    robot = Chatterbox("MNERIM", telemetry_s=0.01)
+    port = PtyPort(robot)
     async with port:
-        await port.until(lambda: len(seen) >= 2)
-    count = len(seen)
+        await port.until(lambda: robot.spoken >= 2)
+    count = robot.spoken
     await port.close()
-    await asyncio.sleep(0.05)  # the one promise about time passing: nothing comes in it
-    assert len(seen) == count
+    await asyncio.sleep(0.05)  # That nothing comes can only be seen by waiting.
+    assert robot.spoken == count
