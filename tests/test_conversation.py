@@ -352,6 +352,15 @@ async def test_a_robot_between_busy_and_free_for_ever_ends_at_the_deadline_witho
 
 
 @jumping
+async def test_a_busy_robot_that_says_free_unasked_is_asked_before_it_is_told_again() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    scripts = iter([[(0.1, b"B"), (0.2, b"F")], [(0.1, b"F")], [(0.1, b"A")]])
+    robots.script = lambda _: next(scripts)
+    assert (await robots.hexa("garra", 90)).status == "sucesso"
+    assert [payload for _, payload in robots.sent] == [b"\x04\x7f", b"?", b"\x04\x7f"]
+
+
+@jumping
 async def test_a_busy_robot_that_does_not_know_avail_is_busy() -> None:
     robots = Robots(busy_poll_s=0.5)
     robots.script = lambda frame: [(0.1, b"W" if frame.payload == b"?" else b"B")]

@@ -136,6 +136,7 @@ def test_a_complex_answer_is_its_fields() -> None:
     request = PROFILE.request("complex", ["aa"])
     assert PROFILE.read(request, heard(2, 1, 2, 0xAA, 0xBB, 0xCC)) == Reply(None, ("aa", "bbcc"))
     assert PROFILE.read(request, heard(2, 9, 9, 0xAA)) is None
+    assert PROFILE.read(PROFILE.request("garra", [1]), heard(1, 1, 0xAA)) is None
 
 
 def test_commands_are_the_ping_the_nodes_and_the_raw_packets() -> None:

@@ -132,6 +132,7 @@ def test_a_robot_cannot_change_the_questions_of_the_document() -> None:
     profile = PsiuProfile()
     profile.learn(Command(name="quantoscomandos", ints=3))
     assert profile.request("quantoscomandos", []).question
+    assert [command.name for command in profile.commands()].count("quantoscomandos") == 1
 
 
 def test_commands_are_the_documents_until_the_robot_has_listed_its_own() -> None:
