@@ -10,7 +10,7 @@ from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Value
 from psiu_broker.profiles.node import Node
 from psiu_broker.profiles.profile import Notice, Profile, Reading, Reply, Request
-from psiu_broker.profiles.psiu import typed
+from psiu_broker.profiles.psiu import COUNT, NAME, SHOW, SHOW_PRINTED, typed
 
 __all__ = ["ACK", "AVAILABLE", "BUSY", "FREE", "NAK", "RESERVED", "WTF", "HexaProfile", "Node"]
 
@@ -20,8 +20,8 @@ BUSY: Final = 66
 AVAILABLE: Final = 63
 FREE: Final = 70
 WTF: Final = 87
-RESERVED: Final = frozenset({"ping", "node", "complex"})
-"""What no node can be called: the commands that every robot of this protocol has."""
+RESERVED: Final = frozenset({"ping", "node", "complex", NAME, COUNT, SHOW, SHOW_PRINTED})
+"""What no node can be called: commands that every robot has, and those that the broker answers for it."""
 _NOTICES: Final = {NAK: Notice.AGAIN, BUSY: Notice.BUSY, FREE: Notice.FREE, WTF: Notice.IMPOSSIBLE}
 _ANSWER_BIT: Final = 0x80
 _SHORTEST_COMPLEX: Final = 3

@@ -9,6 +9,7 @@ from psiu_broker.errors import CallError
 from psiu_broker.frame import Address, Frame
 from psiu_broker.messages import Value
 from psiu_broker.profiles import HexaProfile, Node, Notice, Reply
+from psiu_broker.profiles.hexa import RESERVED
 
 ARM = Address.numbered(0x12)
 BASE = Address.numbered(1)
@@ -146,6 +147,11 @@ def test_commands_are_the_ping_the_nodes_and_the_raw_packets() -> None:
     assert (garra.ints, garra.floats, garra.minimum, garra.maximum, garra.unit) == (0, 1, -90, 90, "deg")
     assert (commands["luz"].ints, commands["luz"].maximum) == (1, 1)
     assert (commands["sonar"].ints, commands["sonar"].floats, commands["sonar"].unit) == (0, 0, "cm")
+
+
+def test_no_node_can_take_the_name_of_a_command_that_is_not_its_own() -> None:
+    raw = {command.name for command in HexaProfile({}).commands()}
+    assert raw | {"qualseunome", "quantoscomandos", "exibecomando", "exibecomandos"} == RESERVED
 
 
 def test_a_busy_robot_is_asked_with_avail() -> None:
