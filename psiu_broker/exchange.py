@@ -7,7 +7,7 @@ from math import inf
 from typing import Literal, Protocol, cast
 
 from psiu_broker.codecs import psiu_ascii
-from psiu_broker.frame import Address, Frame, Malformed, Way, peer_text
+from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
 from psiu_broker.routing.holding import Holding
@@ -61,6 +61,9 @@ class Resident(Protocol):
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         """Bytes that were no frame: perhaps a robot's complaint, perhaps one to make ourselves."""
+
+    def asked_names(self, ways: Iterable[Way], now: float) -> None:
+        """The broker has just asked for names there: the next qualseunome from each robot is its answer."""
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         """A frame of the broker's own that waited was dropped."""
@@ -144,14 +147,13 @@ class Exchange:
         """
         return self.heard(frame, SELF, now, patience_s)
 
-    def send_on(self, link: Link, frame: Frame, now: float) -> None:
-        """Send a frame of the broker's own to every far end of one link, whatever the routes say."""
-        self._send_by(link.ways(), frame, now)
+    def ask_names(self, link: Link, now: float) -> None:
+        """Ask everyone on one link who they are."""
+        self._ask_names(EVERYONE, link.ways(), now)
 
     def ask_for(self, robot: Address, now: float) -> None:
         """Ask for a robot by its name on every link where it may hear its name."""
-        hops = self.router.decide(robot, "psiu-ascii", SELF).hops
-        self._send_by(hops, psiu_ascii.message(self._own_name, robot, "qualseunome"), now)
+        self._ask_names(robot, self.router.decide(robot, "psiu-ascii", SELF).hops, now)
 
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None:
         final = fate.settle(verdict)
@@ -266,10 +268,12 @@ class Exchange:
         if not self.holding.add(frame, way, now):
             return NO_ROUTE
         if not asked:
-            self._send_by(hops, psiu_ascii.message(self._own_name, frame.destination, "qualseunome"), now)
+            self._ask_names(frame.destination, hops, now)
         return None
 
-    def _send_by(self, hops: tuple[Way, ...], frame: Frame, now: float) -> None:
+    def _ask_names(self, robot: Address, hops: tuple[Way, ...], now: float) -> None:
+        frame = psiu_ascii.message(self._own_name, robot, "qualseunome")
+        self.resident.asked_names(hops, now)
         account = self.accounts[SELF.link]
         account.arrived += 1
         verdict = self._spread(frame, hops, SELF, now) if hops else NO_ROUTE

@@ -14,6 +14,7 @@ from math import inf
 from typing import Final, Literal, Protocol
 
 from psiu_broker.adapter import Peer, Transport
+from psiu_broker.codecs.avr import avr_trouble
 from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration
 from psiu_broker.errors import EncodeError, LinkError
@@ -83,13 +84,16 @@ class Link:
         """Encodes what leaves; decodes too where each datagram stands alone."""
         self.state: State = "waiting"
         self.reason: str | None = "not opened yet"
+        """What it waits for, in words; None while it is open."""
         self.since = clock()
+        self._told: tuple[State, str | None] = (self.state, self.reason)
         self.frames_in = self.frames_out = self.malformed = self.opened = 0
         self.last_heard: float | None = None
         self.outbox = Outbox(configuration.options.queue_frames)
         self._askers = Askers() if unaddressed else None
         self._make_codec = codec
         self._hub = hub
+        self._avr_limits = configuration.options.avr_limits
         self._max_age_s = configuration.options.max_age_s
         self._clock = clock
         self._transport: Transport | None = None
@@ -175,6 +179,8 @@ class Link:
                 return REFUSED
         if self._askers is not None:
             self._askers.note(frame.destination, frame.source, now)
+        if self._avr_limits:
+            self._warn_of_avr(frame, wire)
         if not self.outbox.size and transport.write(wire, peer):
             self.frames_out += 1
             if self._hub.bus.raw_listened:
@@ -253,6 +259,11 @@ class Link:
         asker = self._askers.of(frame.source, now) if self._askers is not None else None
         return frame if asker is None else frame._replace(destination=asker)
 
+    def _warn_of_avr(self, frame: Frame, wire: bytes) -> None:
+        trouble = avr_trouble(wire) if frame.protocol == "psiu-ascii" else None
+        if trouble is not None:
+            log.warning("link %s: %s may not understand %s: %s", self.name, frame.destination, frame.subject, trouble)
+
     def _end(self, peer: Peer) -> _End:
         codec = self.codec if self.adapter.datagrams else self._make_codec()
         end = self._ends[peer] = _End(Way(self.name, peer), codec)
@@ -307,7 +318,9 @@ class Link:
                 await changed
 
     def _set_state(self, state: State, reason: str | None) -> None:
-        if (state, reason) != (self.state, self.reason):
-            if state != "opening":
-                log.info("link %s: %s%s", self.name, state, f": {reason}" if reason else "")
-            self.state, self.reason, self.since = state, reason, self._clock()
+        """Attempts to open are no news while they end as the last one did."""
+        self.state, self.reason = state, reason
+        if state != "opening" and (state, reason) != self._told:
+            self._told = state, reason
+            self.since = self._clock()
+            log.info("link %s: %s%s", self.name, state, f": {reason}" if reason else "")

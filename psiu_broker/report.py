@@ -112,7 +112,13 @@ class Report:
             steps.append(self._where(destination, target))
         steps.append(self._outcome(decision, destination, protocol, target))
         delivered = decision.action in ("forward", "flood", "answer", "translate")
-        return Why(a=str(source), b=str(destination), delivered=delivered, verdict=decision.verdict or decision.action, steps=steps)
+        return Why(
+            a=str(source),
+            b=str(destination),
+            delivered=delivered,
+            verdict=decision.verdict or decision.action,
+            steps=steps,
+        )
 
     def _where(self, address: Address, route: table.Route | None) -> str:
         now = self._clock()

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import random
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -36,6 +36,8 @@ SOUGHT_S: Final = 1.0
 """How long a call waits for an unknown robot to answer to its name."""
 LISTENING_S: Final = 0.6
 """How long a discovery waits for robots to say their names."""
+NAME_WITHIN_S: Final = 2.0
+"""How long after our question a name is its answer."""
 TASKS_KEPT: Final = 64
 COMMANDS_ASKED: Final = 64
 NAK_EVERY_S: Final = 0.1
@@ -49,6 +51,14 @@ _DROPPED: Final[dict[Verdict, tuple[CallCode, str]]] = {
     "duplicate": ("refused", "the same frame was just heard from another sender"),
     "same_way": ("unknown_robot", "it is the broker itself"),
 }
+
+
+@dataclass(slots=True)
+class _Asked:
+    """When we asked for names somewhere, and who has answered."""
+
+    at: float
+    answered: set[Address] = field(default_factory=set)
 
 
 @dataclass(slots=True)
@@ -76,11 +86,12 @@ class Resident:
         self._searches: dict[Address, _Search] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._naks: dict[Way, float] = {}
+        self._asked: dict[Way, _Asked] = {}
 
     # exchange.Resident
 
     def answer(self, frame: Frame, way: Way, now: float) -> None:
-        if self._conversations.heard(frame, now):
+        if self._conversations.heard(frame, now) or self._says_its_name(frame, way, now):
             return
         reply = self._responder.answer(frame, now, self._conversations.pinging(frame.source))
         if reply is None:
@@ -111,6 +122,10 @@ class Resident:
             self._naks[way] = now
             self._exchange.send(nak, now)
 
+    def asked_names(self, ways: Iterable[Way], now: float) -> None:
+        self._asked = {way: asked for way, asked in self._asked.items() if now - asked.at < NAME_WITHIN_S}
+        self._asked.update({way: _Asked(now) for way in ways})
+
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self._conversations.undelivered(frame, _dropped(frame.destination, verdict))
 
@@ -119,8 +134,7 @@ class Resident:
         if not link.configuration.options.greet:
             return
         if link.codec.protocol == "psiu-ascii" and link.configuration.options.wildcard:
-            question = psiu_ascii.message(self.name, EVERYONE, NAME)
-            self._exchange.send_on(link, question, now)
+            self._exchange.ask_names(link, now)
         for route in self._router.robots():
             if route.way.link == link.name and route.protocol == "psiu-hexa" and len(self._tasks) < TASKS_KEPT:
                 self._start(self._greet(route))
@@ -222,16 +236,33 @@ class Resident:
             own = Address.numbered(codec.local, codec.domain)
             return own, address, lambda request: psiu_hexa.packet(own, address, request.payload)
         address = route.robot
-        return self.name, address, lambda request: psiu_ascii.message(
-            self.name, address, *request.payload.decode("ascii").split(" ")
+        return (
+            self.name,
+            address,
+            lambda request: psiu_ascii.message(self.name, address, *request.payload.decode("ascii").split(" ")),
         )
 
     def _make_profile(self, route: Route) -> Profile:
         options = self._exchange.links[route.way.link].configuration.options
         if route.protocol == "psiu-hexa":
             robot = self._robots.get(route.robot)
-            return HexaProfile(robot.nodes if robot is not None else {}, timeout_s=options.timeout_s)
+            if robot is None:
+                return HexaProfile({}, options.timeout_s)
+            return HexaProfile(robot.nodes, options.timeout_s, robot.sensor_reply)
         return PsiuProfile(timeout_s=options.timeout_s)
+
+    def _says_its_name(self, frame: Frame, way: Way, now: float) -> bool:
+        """Whether `frame` answers our qualseunome: the first one from its sender where and soon after we asked.
+
+        Any other is a question to us, and in the same words.
+        """
+        asked = self._asked.get(way)
+        if frame.subject != NAME or frame.destination != self.name or asked is None:
+            return False
+        if now - asked.at > NAME_WITHIN_S or frame.source in asked.answered:
+            return False
+        asked.answered.add(frame.source)
+        return True
 
     def _nak(self, link: Link, malformed: Malformed) -> Frame | None:
         """Our NAK to a packet with a bad check, where it is ours to say (PSIU HEXA row 7)."""
@@ -305,7 +336,9 @@ class Resident:
         ago_s = self._clock() - departed.at
         link = self._exchange.links[departed.link]
         if link.state == "open":
-            raise CallError("unknown_robot", f"{robot} was last heard on {link.name}; it was given up {ago_s:.0f} s ago")
+            raise CallError(
+                "unknown_robot", f"{robot} was last heard on {link.name}; it was given up {ago_s:.0f} s ago"
+            )
         raise CallError("link_down", f"{robot} was on {link.name}, which went down {ago_s:.0f} s ago: {link.reason}")
 
     async def _discover(self) -> list[str]:
@@ -313,7 +346,7 @@ class Resident:
         now = self._clock()
         for link in self._exchange.links.values():
             if link.state == "open" and link.codec.protocol == "psiu-ascii":
-                self._exchange.send_on(link, psiu_ascii.message(self.name, EVERYONE, NAME), now)
+                self._exchange.ask_names(link, now)
         await asyncio.sleep(LISTENING_S)
         routes = self._router.robots()
         await asyncio.gather(*(self._inquire(route) for route in routes))

@@ -1,6 +1,6 @@
 """The exchange with real links, routes and codecs; only the far ends are lists."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import pytest
 from hypothesis import settings
@@ -40,6 +40,7 @@ class Resident:
         return ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None: ...
+    def asked_names(self, ways: Iterable[Way], now: float) -> None: ...
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self.undelivered_frames.append((frame, verdict))
 

@@ -257,6 +257,18 @@ async def test_an_answer_without_a_destination_is_for_whom_the_robot_was_last_ad
     assert [frame.destination.number for frame, _ in hub.frames] == [0, 7]
 
 
+async def test_a_robot_with_small_buffers_is_warned_about_and_gets_its_frame(
+    hub: Hub, caplog: pytest.LogCaptureFixture
+) -> None:
+    transport = MemoryTransport()
+    link = connected(hub, transport, avr_limits=True)
+    link.offer(command(), None, ARRIVED, 0.0)
+    assert not caplog.records
+    link.offer(psiu_ascii.message(PC, MNERIM, "x" * 21), None, ARRIVED, 0.0)
+    assert "may not understand" in caplog.text
+    assert len(transport.wires) == 2
+
+
 async def test_every_frame_that_leaves_can_be_watched(hub: Hub) -> None:
     transport = MemoryTransport()
     link = connected(hub, transport)

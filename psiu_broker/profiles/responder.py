@@ -41,10 +41,14 @@ class Responder:
 
     def _words(self, frame: Frame, now: float) -> Frame | None:
         words = said(frame)
-        if words.answer or not words.command:
+        if not words.command:
             return None
         if canonical(words.command) == NAME:
-            return _say(self.name, frame, NAME)
+            # Question and answer look alike, and a robot may take our answer for a question.
+            asked = frame.destination == EVERYONE or self._rarely((frame.source, NAME), now)
+            return _say(self.name, frame, NAME) if asked else None
+        if words.answer:
+            return None
         told = _listing(words, frame, self.name, self._commands)
         if told is None and frame.destination != EVERYONE and self._rarely((frame.source, words.command), now):
             told = refusal(frame, self.name)

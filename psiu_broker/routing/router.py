@@ -101,7 +101,8 @@ class Router:
             return Decision("flood", self._everyone(protocol, arrived))
         target = self._routes.get(destination)
         if target is None:
-            hops = self._everyone(protocol, arrived)
+            # Only names can be asked for; a PSIU HEXA number is found by its own first packet.
+            hops = () if destination.is_numbered else self._everyone(protocol, arrived)
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER

@@ -51,6 +51,13 @@ def test_the_broker_tells_its_name_to_everyone_who_asks() -> None:
     assert answered("qualseunome", EVERYONE) == "qualseunome"
 
 
+def test_the_broker_tells_its_name_to_who_asks_it_but_not_to_a_robot_that_asks_back_for_ever() -> None:
+    responder = Responder("base")
+    assert responder.answer(ask("qualseunome"), 0.0) is not None
+    assert responder.answer(ask("qualseunome"), 0.1) is None
+    assert responder.answer(ask("qualseunome"), 2.1) is not None
+
+
 def test_a_command_to_everyone_is_not_refused() -> None:
     assert answered("parafrente 100", EVERYONE) is None
 
@@ -63,7 +70,6 @@ def test_a_command_to_everyone_is_not_refused() -> None:
         "parafrente OK",
         "quantoscomandos 6",
         "exibecomando parafrente 1 0 0",
-        "qualseunome",
     ],
 )
 def test_an_answer_is_never_answered(message: str) -> None:

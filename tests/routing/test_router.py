@@ -102,11 +102,14 @@ def test_an_unknown_robot_is_asked_for_on_the_links_that_speak_its_protocol(rout
     assert set(decision.hops) == {RADIO, LAPTOP}
 
 
+def test_a_number_cannot_be_asked_for(router: Router) -> None:
+    assert router.decide(Address.numbered(9), "psiu-hexa", PHONE).verdict == "no_route"
+
+
 def test_without_anybody_to_ask_there_is_no_route(router: Router) -> None:
     router.link_down("radio", 0.0)
     router.link_down("wifi", 0.0)
     assert router.decide(MNERIM, "psiu-ascii", PHONE).verdict == "no_route"
-    assert router.decide(Address.numbered(9), "psiu-hexa", ARM).verdict == "no_route"
 
 
 def test_what_a_lost_link_taught_is_forgotten_and_its_robots_are_named(router: Router) -> None:

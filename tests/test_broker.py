@@ -1,0 +1,274 @@
+"""A whole broker in this process: real ptys, UDP sockets and a real Zenoh session; simulated robots at the far ends."""
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from psiu_broker.broker import Broker
+from psiu_broker.config import load
+from psiu_broker.errors import BusError, CallError
+from psiu_broker.frame import Address
+from psiu_broker.messages import Answer, CallRequest
+from psiu_broker.simulator import AsciiRobot, Extra, HexaRobot, PtyPort, UdpPort
+
+CONFIGURATION = """
+[broker]
+name = "base"
+[zenoh]
+listen = ["tcp/127.0.0.1:{bus}"]
+[links.radio]
+adapter = "serial"
+device = "{radio}"
+baudrate = 115200
+protocol = "psiu-ascii"
+timeout_s = 0.2
+[links.wifi]
+adapter = "udp"
+listen = "127.0.0.1:{wifi}"
+protocol = "psiu-ascii"
+[links.arm]
+adapter = "serial"
+device = "{arm}"
+baudrate = 115200
+protocol = "psiu-hexa"
+topology = "point-to-point"
+timeout_s = 0.2
+[robots.BRACO]
+address = 0x12
+link = "arm"
+nodes.garra = {{ node = 4, type = "servo" }}
+nodes.sonar = {{ node = 7, type = "distance", unit = "cm" }}
+"""
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
+    """The broker's state is values, not events: look until it is so."""
+    async with asyncio.timeout(timeout_s):
+        while not true():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+class Lab:
+    """A broker between three robots: MNERIM on a pty, BETA on UDP, an arm on a second pty."""
+
+    def __init__(self, folder: Path) -> None:
+        self.wifi = free_port(socket.SOCK_DGRAM)
+        self.mnerim = AsciiRobot("MNERIM", extras=[Extra.parse("distancia:0=42")])
+        self.beta = AsciiRobot("BETA")
+        self.braco = HexaRobot(0x12, topology="point-to-point", actuators=(4,), sensors={7: 99})
+        self.radio = PtyPort(self.mnerim, link=folder / "radio")
+        self.phone = UdpPort(self.beta, peer=f"127.0.0.1:{self.wifi}")
+        self.arm = PtyPort(self.braco, link=folder / "arm")
+        self.file = folder / "lab.toml"
+        self.file.write_text(
+            CONFIGURATION.format(bus=free_port(), radio=self.radio.path, wifi=self.wifi, arm=self.arm.path)
+        )
+        self.broker = Broker(load(self.file))
+
+    async def __aenter__(self) -> "Lab":
+        await self.radio.open()
+        await self.arm.open()
+        await self.broker.start()
+        await until(lambda: all(link.state == "open" for link in self.broker.links()))
+        await self.phone.open()
+        await until(lambda: {"MNERIM", "BETA"} <= self.heard())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.broker.stop()
+        for port in (self.radio, self.phone, self.arm):
+            await port.close()
+
+    def heard(self) -> set[str]:
+        return {card.robot for card in self.broker.cards().values() if card.last_heard is not None}
+
+    async def call(self, robot: str, command: str, *parameters: int | float | str, timeout_s: float = 5.0) -> Answer:
+        request = CallRequest(parameters=list(parameters), timeout_s=timeout_s)
+        return await self.broker.call(Address.parse(robot), command, request)
+
+
+@pytest.fixture
+async def lab(tmp_path: Path) -> AsyncIterator[Lab]:
+    async with Lab(tmp_path) as lab:
+        yield lab
+        assert lab.broker.ledger().balances
+
+
+async def test_robots_are_greeted_and_known_before_anybody_needs_them(lab: Lab) -> None:
+    await until(lambda: {"MNERIM", "BETA", "BRACO"} <= lab.heard())
+    cards = {card.robot: card for card in lab.broker.cards().values()}
+    assert (cards["MNERIM"].link, cards["MNERIM"].protocol) == ("radio", "psiu-ascii")
+    assert cards["BETA"].peer == lab.phone.address
+    assert cards["BRACO"].address == "0x12"
+    assert await lab.broker.healthy()
+
+
+async def test_a_call_moves_the_robot_and_returns_its_answer(lab: Lab) -> None:
+    answer = await lab.call("MNERIM", "parafrente", 100)
+    assert (answer.status, answer.values) == ("sucesso", [])
+    assert lab.mnerim.position.x == 100
+
+
+async def test_a_value_comes_back_with_its_type(lab: Lab) -> None:
+    assert (await lab.call("MNERIM", "distancia")).values == [42]
+
+
+async def test_a_robot_of_bytes_is_called_by_the_names_and_units_of_its_nodes(lab: Lab) -> None:
+    assert (await lab.call("BRACO", "garra", -90)).status == "sucesso"
+    assert lab.braco.signals[4] == 0x80
+    sonar = await lab.call("BRACO", "sonar")
+    assert (sonar.values, sonar.unit) == ([99], "cm")
+    assert (await lab.call("0x12", "ping")).status == "sucesso"
+
+
+async def test_a_value_out_of_range_is_refused_before_it_is_sent(lab: Lab) -> None:
+    with pytest.raises(CallError, match="parafrente takes 0–999 cm, got 1200") as refused:
+        await lab.call("MNERIM", "parafrente", 1200)
+    assert refused.value.code == "refused"
+    assert all(heard.subject != "parafrente" for heard in lab.mnerim.heard)
+
+
+async def test_an_absent_robot_is_said_to_be_unknown_within_the_deadline(lab: Lab) -> None:
+    begun = time.monotonic()
+    with pytest.raises(CallError, match="no robot NINGUEM") as unknown:
+        await lab.call("NINGUEM", "parafrente", 1, timeout_s=0.3)
+    assert unknown.value.code == "unknown_robot"
+    assert time.monotonic() - begun < 1.0
+
+
+async def test_one_robot_orders_another_across_links_and_hears_its_answer(lab: Lab) -> None:
+    lab.phone.send(lab.beta.command("MNERIM", "parafrente", 50))
+    await lab.radio.until(lambda: lab.mnerim.position.x == 50)
+    await lab.phone.until(lambda: any(heard.parameters == ("sucesso",) for heard in lab.beta.heard))
+
+
+async def test_words_move_an_arm_of_bytes_and_the_answer_comes_in_its_name(lab: Lab) -> None:
+    lab.phone.send(lab.beta.command("BRACO", "garra", 45))
+    await lab.phone.until(
+        lambda: any((heard.source, heard.parameters) == ("BRACO", ("sucesso",)) for heard in lab.beta.heard)
+    )
+    assert lab.braco.signals[4] == round(45 * 127 / 90)
+    lab.phone.send(lab.beta.command("BRACO", "garra", 500))
+    await lab.phone.until(lambda: any(heard.parameters == ("falha",) for heard in lab.beta.heard))
+    lab.phone.send(lab.beta.command("BRACO", "quantoscomandos"))
+    await lab.phone.until(lambda: any(heard.subject == "quantoscomandos" for heard in lab.beta.heard))
+
+
+async def test_the_broker_is_a_robot_that_answers_within_forty_milliseconds(lab: Lab) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.setblocking(False)
+        loop = asyncio.get_running_loop()
+
+        async def ask(wire: bytes) -> tuple[bytes, float]:
+            begun = time.monotonic()
+            await loop.sock_sendto(program, wire, ("127.0.0.1", lab.wifi))
+            async with asyncio.timeout(2):
+                while not (answer := await loop.sock_recv(program, 1024)).endswith(b"base 0", -11, -4):
+                    pass
+            return answer, time.monotonic() - begun
+
+        answers = [
+            await ask(b"?? 027 qualseunome PC 01753"),
+            await ask(_wire("base", "qualseunome")),
+            await ask(_wire("base", "quantoscomandos")),
+            await ask(_wire("base", "exibecomando", "3")),
+            await ask(_wire("base", "exibecomando", "99")),
+        ]
+    assert [answer.split()[2:-2] for answer, _ in answers] == [
+        [b"qualseunome"],
+        [b"qualseunome"],
+        [b"quantoscomandos", b"3"],
+        [b"exibecomando", b"exibecomando", b"1", b"0", b"0"],
+        [b"exibecomando", b"falha"],
+    ]
+    assert sorted(took for _, took in answers)[2] < 0.04
+
+
+def _wire(destination: str, *words: str) -> bytes:
+    length = len(f"{destination} 000 {' '.join(words)} PC 00000")
+    body = f"{destination} {length:03d} {' '.join(words)} PC ".encode()
+    return body + b"%05d" % (sum(body) % 65536)
+
+
+async def test_a_name_that_answers_our_question_is_not_answered_in_turn(lab: Lab) -> None:
+    talk: list[bytes] = []
+    lab.mnerim.receive = lambda data, now: talk.append(data) or []  # type: ignore[func-returns-value, method-assign]
+    link = lab.broker.exchange.links["radio"]
+    lab.broker.exchange.ask_names(link, time.monotonic())
+    lab.radio.send(lab.mnerim.say("base", "qualseunome"))
+    lab.radio.send(lab.mnerim.say("base", "quantoscomandos"))
+    await lab.radio.until(lambda: any(b"quantoscomandos 3" in data for data in talk))
+    assert b"".join(talk).count(b"qualseunome") == 1
+
+
+async def test_discovery_learns_what_each_robot_can_do(lab: Lab) -> None:
+    names = (await lab.call("base", "discover")).values
+    assert {"MNERIM", "BETA", "BRACO"} <= set(names)
+    cards = {card.robot: card for card in lab.broker.cards().values()}
+    assert "distancia" in {command.name for command in cards["MNERIM"].commands}
+    assert {"ping", "garra", "sonar"} <= {command.name for command in cards["BRACO"].commands}
+
+
+async def test_an_unplugged_radio_says_so_harms_no_other_link_and_comes_back(lab: Lab) -> None:
+    lab.radio.unplug()
+    await until(lambda: lab.broker.links()[0].state == "waiting")
+    with pytest.raises(CallError, match="radio") as down:
+        await lab.call("MNERIM", "parafrente", 1, timeout_s=0.3)
+    assert down.value.code == "link_down"
+    assert (await lab.call("BETA", "parafrente", 1)).status == "sucesso"
+    lab.radio.plug()
+    await until(lambda: "MNERIM" in lab.heard())
+    assert (await lab.call("MNERIM", "parafrente", 1)).status == "sucesso"
+    assert lab.broker.links()[0].reopened >= 1
+
+
+async def test_a_cable_pulled_in_the_middle_of_a_frame_leaves_nothing_behind(lab: Lab) -> None:
+    answer = lab.mnerim.say("BETA", "parafrente", "sucesso")
+    heard = lab.broker.links()[0].frames_in
+    lab.radio.send(answer[:15])
+    lab.radio.unplug()
+    await until(lambda: lab.broker.links()[0].state == "waiting")
+    lab.radio.plug()
+    await until(lambda: lab.broker.links()[0].state == "open")
+    lab.radio.send(answer[15:])
+    lab.radio.send(lab.mnerim.say("BETA", "paratras", "sucesso"))
+    await lab.phone.until(lambda: any(heard.subject == "paratras" for heard in lab.beta.heard))
+    assert all(heard.subject != "parafrente" for heard in lab.beta.heard)
+    assert lab.broker.links()[0].frames_in > heard
+
+
+async def test_a_motion_is_never_repeated_on_silence(lab: Lab) -> None:
+    arrived: list[bytes] = []
+    lab.mnerim.receive = lambda data, now: arrived.append(data) or []  # type: ignore[func-returns-value, method-assign]
+    with pytest.raises(CallError) as unknown:
+        await lab.call("MNERIM", "parafrente", 1, timeout_s=0.6)
+    assert unknown.value.code == "outcome_unknown"
+    with pytest.raises(CallError, match="after 3 tries") as silent:
+        await lab.call("MNERIM", "quantoscomandos", timeout_s=0.6)
+    assert silent.value.code == "no_answer"
+    assert b"".join(arrived).count(b"parafrente") == 1
+    assert b"".join(arrived).count(b"quantoscomandos") == 3
+
+
+async def test_why_tells_the_decision_and_its_reasons(lab: Lab) -> None:
+    there = lab.broker.why(Address.named("BETA"), Address.named("MNERIM"))
+    assert there.delivered
+    assert any("radio" in step and "learned" in step for step in there.steps)
+    nowhere = lab.broker.why(Address.named("BETA"), Address.numbered(0x77))
+    assert not nowhere.delivered
+    assert nowhere.verdict == "no_route"
+
+
+async def test_a_port_that_is_taken_is_one_clear_line(lab: Lab) -> None:
+    with pytest.raises(BusError, match="in use"):
+        await Broker(load(lab.file)).start()
