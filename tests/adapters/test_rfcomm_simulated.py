@@ -1,8 +1,8 @@
-"""RFCOMM end to end: the adapter, mocked D-Bus, and an HC-05-like robot over real RFCOMM and SDP between controllers."""
+"""RFCOMM end to end: adapter, mocked D-Bus, then real RFCOMM and SDP to a simulated robot on virtual controllers."""
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -19,32 +19,14 @@ from bumble.hci import Address
 from bumble.host import Host
 from bumble.link import LocalLink
 from bumble.rfcomm import DLC, Client, find_rfcomm_channel_with_uuid
-from bumble.transport import open_transport
-from bumble.transport.common import AsyncPipeSink
+from bumble.transport.common import AsyncPipeSink, StreamPacketSink, StreamPacketSource
 
-from psiu_broker.simulator import rfcomm
+from psiu_broker.simulator import AsciiRobot
+from psiu_broker.simulator.rfcomm import SERIAL_PORT, RfcommPort, serve
 
 HOST = "F0:F1:F2:F3:F4:F5"
-QUESTION = b"?? 029 qualseunome PC "
-ANSWER = b"PC 042 qualseunome HC05 HC05 "
-
-
-def checked(frame: bytes) -> bytes:
-    """`frame` with its PSIU checksum."""
-    return frame + b"%05d" % sum(frame)
-
-
-def psiu_robot(write: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    """Tells its name to whoever asks, however the question is cut."""
-    heard = bytearray()
-
-    def received(data: bytes) -> None:
-        heard.extend(data)
-        if heard.endswith(checked(QUESTION)):
-            heard.clear()
-            write(checked(ANSWER))
-
-    return received
+FORWARD = b"MNERIM 034 parafrente 100 PC 02123"
+DONE = b"PC 038 parafrente sucesso MNERIM 02755"
 
 
 def computer(link: LocalLink, name: str, address: str) -> Device:
@@ -63,14 +45,17 @@ class Radio:
     @contextlib.asynccontextmanager
     async def connected(self, address: str) -> AsyncIterator[DLC]:
         connection = await self._device.connect_classic(address)
-        self.channel = await find_rfcomm_channel_with_uuid(connection, rfcomm.SERIAL_PORT)
+        ended = asyncio.Event()
+        connection.on(connection.EVENT_DISCONNECTION, lambda *_: ended.set())
+        self.channel = await find_rfcomm_channel_with_uuid(connection, SERIAL_PORT)
         assert self.channel is not None
         multiplexer = await Client(connection).start()
         dlc = await multiplexer.open_dlc(self.channel)
         try:
             yield dlc
         finally:
-            await connection.disconnect()
+            if not ended.is_set():
+                await connection.disconnect()
 
 
 async def radio_of(air: LocalLink) -> Radio:
@@ -85,15 +70,59 @@ async def air() -> AsyncIterator[LocalLink]:
     return LocalLink()
 
 
-async def test_a_simulated_robot_is_found_by_sdp_and_answers(air: LocalLink) -> None:
-    await rfcomm.serve(computer(air, "HC-05", ROBOT), psiu_robot, channel=5)
-    radio = await radio_of(air)
+def robot() -> AsciiRobot:
+    return AsciiRobot("MNERIM", answer_s=0.0)
+
+
+async def answer(dlc: DLC, question: bytes, size: int) -> bytes:
+    """Send `question` and wait for `size` bytes."""
     answers: asyncio.Queue[bytes] = asyncio.Queue()
-    async with asyncio.timeout(PATIENCE_S), radio.connected(ROBOT) as dlc:
+    dlc.sink = answers.put_nowait
+    dlc.write(question)
+    heard = b""
+    async with asyncio.timeout(PATIENCE_S):
+        while len(heard) < size:
+            heard += await answers.get()
+    return heard
+
+
+async def test_a_simulated_robot_is_found_by_sdp_and_answers(air: LocalLink) -> None:
+    radio = await radio_of(air)
+    async with RfcommPort(robot(), device=computer(air, "HC-05", ROBOT), channel=5), radio.connected(ROBOT) as dlc:
         assert radio.channel == 5
-        dlc.sink = answers.put_nowait
-        dlc.write(checked(QUESTION))
-        assert await answers.get() == checked(ANSWER)
+        assert await answer(dlc, FORWARD, len(DONE)) == DONE
+
+
+async def test_a_simulated_robot_that_is_switched_off_hangs_up(air: LocalLink) -> None:
+    radio = await radio_of(air)
+    async with RfcommPort(robot(), device=computer(air, "HC-05", ROBOT)) as port, radio.connected(ROBOT) as dlc:
+        closed = asyncio.Event()
+        dlc.on(dlc.EVENT_CLOSE, closed.set)
+        await port.until(lambda: port.callers == 1)
+        port.unplug()
+        async with asyncio.timeout(PATIENCE_S):
+            await closed.wait()
+
+
+async def test_a_robot_behind_a_controller_of_its_own_is_served_until_left(air: LocalLink) -> None:
+    class Chip(StreamPacketSource):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            Controller("HC-05", host_source=self, host_sink=StreamPacketSink(transport), link=air, public_address=ROBOT)
+
+        def connection_lost(self, error: Exception | None) -> None:
+            gone.set()
+
+    gone = asyncio.Event()
+    radio = await radio_of(air)
+    async with await asyncio.get_running_loop().create_server(Chip, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        async with RfcommPort(robot(), hci=f"tcp-client:127.0.0.1:{port}", address=ROBOT, channel=3) as served:
+            async with radio.connected(ROBOT) as dlc:
+                assert radio.channel == 3
+                assert await answer(dlc, FORWARD, len(DONE)) == DONE
+            await served.until(lambda: served.callers == 0)
+        async with asyncio.timeout(PATIENCE_S):
+            await gone.wait()
 
 
 @contextlib.asynccontextmanager
@@ -130,22 +159,38 @@ async def bluetooth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
 
 @needs_mock
 async def test_the_adapter_talks_to_the_robot_over_real_rfcomm(air: LocalLink, bluetooth: Bluetooth) -> None:
-    await rfcomm.serve(computer(air, "HC-05", ROBOT), psiu_robot)
     recorder = Recorder()
     async with (
+        RfcommPort(robot(), device=computer(air, "HC-05", ROBOT)),
         bridged(bluetooth.folder / ROBOT.replace(":", "_"), await radio_of(air), ROBOT),
         opened(Rfcomm(address=ROBOT), recorder) as transport,
     ):
         for turn in range(1, 51):
-            assert transport.write(checked(QUESTION), None)
-            await recorder.until(lambda turn=turn: recorder.data == checked(ANSWER) * turn)  # type: ignore[misc]
+            assert transport.write(FORWARD, None)
+            await recorder.until(lambda turn=turn: recorder.data == DONE * turn)  # type: ignore[misc]
+
+
+@needs_mock
+async def test_a_robot_that_is_switched_off_is_a_lost_link_and_comes_back(air: LocalLink, bluetooth: Bluetooth) -> None:
+    async with (
+        RfcommPort(robot(), device=computer(air, "HC-05", ROBOT)) as port,
+        bridged(bluetooth.folder / ROBOT.replace(":", "_"), await radio_of(air), ROBOT),
+    ):
+        for _ in range(2):
+            port.plug()
+            recorder = Recorder()
+            async with opened(Rfcomm(address=ROBOT), recorder) as transport:
+                assert transport.write(FORWARD, None)
+                await recorder.until(lambda recorder=recorder: recorder.data == DONE)  # type: ignore[misc]
+                port.unplug()
+                await recorder.until(lambda recorder=recorder: recorder.losses)  # type: ignore[misc]
 
 
 @needs_mock
 async def test_a_long_stream_is_cut_into_rfcomm_frames_and_comes_back_whole(
     air: LocalLink, bluetooth: Bluetooth
 ) -> None:
-    await rfcomm.serve(computer(air, "HC-05", ROBOT), lambda write: write)
+    await serve(computer(air, "HC-05", ROBOT), lambda dlc: setattr(dlc, "sink", dlc.write))
     recorder = Recorder()
     frames = [b"%05d" % number * 60 for number in range(200)]
     async with (
@@ -158,19 +203,3 @@ async def test_a_long_stream_is_cut_into_rfcomm_frames_and_comes_back_whole(
                 await recorder.until(lambda rooms=rooms: recorder.rooms > rooms)  # type: ignore[misc]
         await recorder.until(lambda: len(recorder.data) >= sum(map(len, frames)))
         assert recorder.data == b"".join(frames)
-
-
-async def test_a_robot_behind_a_controller_of_its_own_is_served_until_left(
-    air: LocalLink, unused_tcp_port: int
-) -> None:
-    port = f"127.0.0.1:{unused_tcp_port}"
-    async with await open_transport(f"tcp-server:{port}") as hci:
-        Controller("robot", host_source=hci.source, host_sink=hci.sink, link=air, public_address=ROBOT)
-        async with rfcomm.serial_port(f"tcp-client:{port}", psiu_robot, address=ROBOT, channel=3):
-            radio = await radio_of(air)
-            answers: asyncio.Queue[bytes] = asyncio.Queue()
-            async with asyncio.timeout(PATIENCE_S), radio.connected(ROBOT) as dlc:
-                dlc.sink = answers.put_nowait
-                dlc.write(checked(QUESTION))
-                assert await answers.get() == checked(ANSWER)
-                assert radio.channel == 3
