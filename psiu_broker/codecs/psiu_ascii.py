@@ -273,9 +273,10 @@ class PsiuAscii(Codec):
             return NOISE
         summed = kept.rfind(b" ") + 1
         ending = kept[summed:]
-        if len(ending) in {4, 5} and ending.isdigit():
-            return _BAD_SIZE if byte_sum(kept[:summed]) == int(ending) else _BAD_CHECKSUM
-        return _BAD_CHECKSUM if CHECKSUM_FIELD.search(kept, field.end() - 1) else _UNFINISHED
+        if len(ending) == 5 and ending.isdigit() and byte_sum(kept[:summed]) == int(ending):
+            return _BAD_SIZE
+        looks_whole = len(ending) == 4 and ending.isdigit()
+        return _BAD_CHECKSUM if looks_whole or CHECKSUM_FIELD.search(kept, field.end() - 1) else _UNFINISHED
 
 
 def _name(address: Address) -> bytes:
