@@ -293,7 +293,7 @@ class _Bus:
         zenoh = broker.configuration.zenoh
         name = broker.configuration.broker.name
         keys = Keys(zenoh.prefix)
-        session = await Session.open(zenoh.listen, zenoh.connect, lost=lambda _: lost())
+        session = await Session.open(zenoh.listen, lost=lambda _: lost())
         try:
             return cls(
                 session,

@@ -96,7 +96,6 @@ def test_the_configuration_of_the_readme_loads_as_written(read):
     assert configuration.broker.name == "base"
     assert configuration.broker.address == 0
     assert configuration.zenoh.listen == ("tcp/127.0.0.1:7447",)
-    assert configuration.zenoh.connect == ()
     assert configuration.zenoh.prefix == "psiu"
     assert configuration.warnings == ()
     radio, wifi, arm = configuration.links.values()
@@ -231,8 +230,8 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         ),
         ("[links]\nradio = 3", "links.radio: expected a table, got 3; write [links.radio] above its keys"),
         (
-            '[zenoh]\nconnect = ["10.0.0.1:7447"]',
-            "zenoh.connect[0]: expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH),"
+            '[zenoh]\nlisten = ["10.0.0.1:7447"]',
+            "zenoh.listen[0]: expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH),"
             ' got "10.0.0.1:7447"; write it like tcp/127.0.0.1:7447',
         ),
         ('[zenoh]\nlisten = ["serial/dev/ttyUSB0:1"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),

@@ -67,7 +67,6 @@ class ZenohConfiguration(_Table):
     """``[zenoh]``: where other programs find the broker."""
 
     listen: tuple[Endpoint, ...] = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
-    connect: tuple[Endpoint, ...] = Field((), description="other brokers to connect to")
     prefix: Prefix = Field("psiu", description="the first part of every key")
 
 
