@@ -133,7 +133,10 @@ class Publisher:
 
         def look(_: object) -> None:
             # What is so now: changes of two clients may overtake one another on their way here.
-            setattr(self, flag, not self._session.is_lost and matching(gate))
+            try:
+                setattr(self, flag, not self._session.is_lost and matching(gate))
+            except zenoh.ZError:  # closed meanwhile
+                setattr(self, flag, False)
 
         try:
             gate, listener = await asyncio.to_thread(declare)

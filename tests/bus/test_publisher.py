@@ -275,15 +275,13 @@ sys.stdin.read()
             await asyncio.to_thread(stopped.stdout.readline)
             await until(lambda: publisher.listened)
             os.kill(stopped.pid, signal.SIGSTOP)
-            worst_s, end = 0.0, time.monotonic() + 1.5
-            count = 0
+            worst_s, end = 0.0, time.monotonic() + 1  # its lease ends after two seconds
             while time.monotonic() < end:
                 begun = time.monotonic()
-                publisher.publish(COMMAND._replace(subject=f"s{count % 2000}"), RADIO, begun)
+                publisher.publish(COMMAND._replace(subject=f"s{publisher.puts % 2000}"), RADIO, begun)
                 worst_s = max(worst_s, time.monotonic() - begun)
-                count += 1
             assert publisher.failures == 0
-            assert publisher.puts == count > 2000
+            assert publisher.puts > 2000
             assert worst_s < 0.5
         finally:
             stopped.kill()
