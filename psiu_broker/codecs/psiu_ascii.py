@@ -171,15 +171,19 @@ class PsiuAscii(Codec):
         source = self._names.get(words[-2])
         destination = self._names.get(words[0])
         subject = self._subjects.get(words[2])
-        if source is None or destination is None or subject is None or not data.isascii():
+        if source is None or destination is None or subject is None:
             return None
-        text = data.decode()
-        end = -7 - len(words[-2])
-        if not text.isprintable() or (
-            len(words) > 5 and self._sender(text, len(words[0]) + 6, size + end, size - 6) != size + end
-        ):
-            return None
-        payload = data[len(words[0]) + 5 : end]
+        sender = size - 6 - len(words[-2])
+        if len(words) > 5:
+            # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
+            if not data.isascii() or not (text := data.decode()).isprintable():
+                return None
+            start = sender
+            for word in words[-3:2:-1]:
+                start -= len(word) + 1
+                if text[start:-6] in self._directory.names:
+                    return None
+        payload = data[len(words[0]) + 5 : sender - 1]
         return _make(Frame, (source, destination, subject, payload, PROTOCOL, data, _CANONICAL, ""))
 
     def _sender(self, text: str, start: int, space: int, end: int) -> int:

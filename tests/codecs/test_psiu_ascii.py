@@ -183,6 +183,13 @@ def test_an_unpadded_checksum_counts_only_at_a_boundary() -> None:
     assert reasons(read(ascii_codec(strict=True), unpadded)) == ["checksum"]
 
 
+def test_an_unpadded_checksum_is_remarked_upon_even_where_the_size_agrees() -> None:
+    (frame,) = frames(read(ascii_codec(), b"MNERIM 033 parafrente 100 PC 2122"))
+    assert (frame.dialect, frame.remark) == ("psiu-ascii/1/loose", "checksum not padded")
+    assert ascii_codec().encode(frame) == FRAME
+    assert frames(read(ascii_codec(strict=True), frame.wire)) == []
+
+
 def test_half_a_frame_is_given_up_by_silence() -> None:
     codec = ascii_codec()
     assert codec.decode(FRAME[:20], 0.0) == []
@@ -245,9 +252,18 @@ def test_a_right_sum_does_not_make_a_frame_of_what_lacks_a_part(wire: bytes) -> 
     assert frames(read(ascii_codec(), summed(wire))) == []
 
 
-def test_a_checksum_above_65535_fits_nothing() -> None:
-    total = sum(b"PC 021 texto PC ")
-    assert frames(read(ascii_codec(), b"PC 021 texto PC %05d" % (total + 65536))) == []
+def test_a_sum_above_65535_is_said_modulo_65536_or_not_at_all() -> None:
+    body = b"ROBO 724 texto %b PC " % (b"z" * 700)
+    assert sum(body) > 65536
+    assert len(frames(read(ascii_codec(), summed(body)))) == 1
+    assert frames(read(ascii_codec(), body + b"%05d" % sum(body))) == []
+
+
+def test_a_frame_of_more_than_999_bytes_is_none_whatever_its_size_says() -> None:
+    for letters, expected in ((979, 1), (980, 0)):
+        wire = summed(b"ROBO 001 a %b PC " % (b"z" * letters))
+        assert len(wire) == 999 + (1 - expected)
+        assert len(frames(read(ascii_codec(), wire))) == expected
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,15 @@ def test_cuts_far_into_long_noise_give_the_same_events(before: list[bytes], nois
     assert read(ascii_codec(), *pieces) == read(ascii_codec(), whole)
 
 
+@pytest.mark.parametrize("step", [1, 97, 1000, 100_000])
+@pytest.mark.parametrize("claim", [1, 16, 30])
+def test_loose_frames_without_end_and_without_anything_between_are_all_heard(claim: int, step: int) -> None:
+    data = claiming(claim) * 800
+    pieces = [data[at : at + step] for at in range(0, len(data), step)]
+    events = read(ascii_codec(), *pieces)
+    assert [event.wire for event in events] == [claiming(claim)] * 800
+
+
 @given(data=stream, warm=good)
 def test_what_was_heard_before_changes_nothing(data: bytes, warm: bytes) -> None:
     codec = ascii_codec()
