@@ -96,7 +96,8 @@ class Report:
         accounts = [_account(name, account, waiting[name]) for name, account in self._exchange.accounts.items()]
         whole = verdicts.Account(sum(account.arrived for account in accounts))
         for account in self._exchange.accounts.values():
-            whole.fates.update(account.fates)
+            for verdict, count in account.fates.items():
+                whole.fates[verdict] += count
         total = _account("total", whole, sum(waiting.values()))
         return Ledger(accounts=accounts, total=total, balances=all(map(_balances, accounts)))
 
