@@ -1,0 +1,1 @@
+"""The commands: `psiu-broker` for the daemon, `psiu` for people."""

@@ -1,0 +1,95 @@
+"""How the commands reach a broker, and how they say that it cannot be reached."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, Concatenate, Final, ParamSpec, TypeVar
+
+import click
+from pydantic import ValidationError
+
+from psiu_broker.bus.client import Client
+from psiu_broker.bus.keys import Keys
+from psiu_broker.cli.commands import Failure
+from psiu_broker.cli.output import print_json
+from psiu_broker.errors import CallError, PsiuError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+NO_WAY: Final = 3
+"""The exit code where there was no broker, no way to the robot, or no answer."""
+NO_BROKER: Final = "no_broker"
+"""What stands for `error` in JSON where not even a broker answered; the other codes are the broker's."""
+
+
+class NoWay(Failure):
+    """There is no broker, no way to the robot, or no answer from it."""
+
+    exit_code = NO_WAY
+
+
+@dataclass(frozen=True)
+class Connection:
+    """Where the brokers are, and whether the user wants JSON."""
+
+    endpoints: tuple[str, ...]
+    prefix: str
+    as_json: bool
+
+    @contextmanager
+    def client(self) -> Iterator[Client]:
+        """A client for as long as the block lasts; what fails inside ends the command."""
+        try:
+            with Client(self.endpoints, self.prefix) as client:
+                yield client
+        except CallError as error:
+            raise self.failure(error.code, str(error)) from error
+        except PsiuError as error:
+            raise self.failure(NO_BROKER, str(error)) from error
+        except ValidationError as error:
+            raise self.failure(NO_BROKER, "the broker's answer cannot be read; is it newer than this psiu?") from error
+        except ValueError as error:  # a name that no key can carry
+            raise self.failure("bad_request", str(error)) from error
+
+    def failure(self, code: str, message: str) -> Failure:
+        """One line for people, and with --json an object for programs."""
+        if self.as_json:
+            print_json({"error": code, "message": message})
+        return NoWay(message)
+
+    def nobody(self) -> Failure:
+        return self.failure(NO_BROKER, f"there is no broker at {' or '.join(self.endpoints)}")
+
+
+def connects(command: Callable[Concatenate[Connection, P], R]) -> Callable[..., R]:
+    """Give a command --connect, --prefix and --json, and a `Connection` as its first argument."""
+
+    @click.option(
+        "--connect",
+        metavar="ENDPOINT",
+        multiple=True,
+        envvar="PSIU_CONNECT",
+        default=("tcp/127.0.0.1:7447",),
+        help="Where the broker listens; repeat it, or separate by commas, and the first that answers is used."
+        "  [environment: PSIU_CONNECT; default: tcp/127.0.0.1:7447]",
+    )
+    @click.option("--prefix", default="psiu", show_default=True, help="The first part of every key.", callback=_prefix)
+    @click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")
+    @wraps(command)
+    def connected(*args: Any, connect: tuple[str, ...], prefix: str, as_json: bool, **kwargs: Any) -> R:
+        endpoints = tuple(each for text in connect for each in re.split(r"[,\s]+", text) if each)
+        if not endpoints:
+            raise click.UsageError("--connect needs an endpoint, such as tcp/127.0.0.1:7447")
+        return command(Connection(endpoints, prefix, as_json), *args, **kwargs)
+
+    return connected
+
+
+def _prefix(ctx: click.Context, param: click.Parameter, prefix: str) -> str:
+    try:
+        return Keys(prefix).prefix
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error

@@ -1,0 +1,123 @@
+"""`psiu monitor`: what happens on the bus, as it happens."""
+
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Final
+
+import click
+from pydantic_core import from_json, to_json
+
+from psiu_broker.bus.client import Client
+from psiu_broker.bus.keys import chunk, robot
+from psiu_broker.cli.commands import closed_pipe_is_fine, examples
+from psiu_broker.cli.connection import Connection, connects
+from psiu_broker.cli.lines import Message, card_line, frame_line, gone_line, raw_line
+from psiu_broker.cli.output import printable
+from psiu_broker.messages import Card
+
+Wanted = Callable[[Message], bool]
+
+_SHOWN: Final = 200
+
+
+@click.command(
+    epilog=examples(
+        "psiu monitor",
+        "psiu monitor MNERIM",
+        "psiu monitor 'psiu/*/*/parafrente'",
+        "psiu monitor --json | jq -r .command",
+        "psiu monitor --raw radio",
+    )
+)
+@click.argument("key", required=False)
+@click.option("--raw", metavar="LINK|all", help="Every frame of a link instead, with its verdict and bytes.")
+@connects
+def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
+    """Print what robots say, until Ctrl-C.
+
+    KEY is a robot's name or address (what it says and what is said to it), or a Zenoh key with wildcards; left out:
+    everything. With --json: one object a line with its key, else as psiu schema Decoded, Card or RawFrame says.
+    """
+    if key is not None and raw is not None:
+        raise click.UsageError("give a KEY or --raw, not both")
+    with connection.client() as client, suppress(KeyboardInterrupt):
+        cards = client.cards()
+        names = Names(cards)
+        wanted: Wanted = _anything
+        if raw is not None:
+            asked = f"{client.keys.prefix}/@raw/*/{'*' if raw == 'all' else chunk(raw)}"
+        elif key is not None and ("/" in key or "*" in key):
+            asked = key
+        else:
+            asked = f"{client.keys.prefix}/**"
+            wanted = _anything if key is None else _of(key, cards)
+        if sys.stderr.isatty():
+            click.echo(f"Listening to {printable(asked)}; Ctrl-C ends.", err=True)
+        try:
+            for at, kind, payload in client.monitor(asked):
+                message = _gone(client, at) if kind == "delete" else _read(payload)
+                if wanted(message):
+                    names.learn(message)
+                    click.echo(_json(at, message) if connection.as_json else message_line(at, message, names.known))
+                    sys.stdout.flush()
+        except BrokenPipeError:
+            closed_pipe_is_fine()
+
+
+class Names:
+    """The robots by their addresses, so that people read names."""
+
+    def __init__(self, cards: Iterable[Card]) -> None:
+        self.known = {card.address: card.robot for card in cards if card.address is not None}
+
+    def learn(self, message: Message) -> None:
+        """Take in a card."""
+        if "link_state" in message and message.get("address"):
+            self.known[str(message["address"])] = str(message.get("robot"))
+
+
+def message_line(key: str, message: Message, names: Mapping[str, str]) -> str:
+    """A message of the bus for a person, known by its fields."""
+    if "verdict" in message and "direction" in message:
+        return raw_line(message, names)
+    if "kind" in message and "source" in message:
+        return frame_line(message, names)
+    if "link_state" in message:
+        return card_line(message)
+    if "gone" in message:
+        return gone_line(str(message["robot"]))
+    return printable(f"{key}  {message.get('text') or to_json(message).decode()}")
+
+
+def _read(payload: bytes) -> Message:
+    """A payload as an object, whatever it is: anybody may put anything on the bus."""
+    with suppress(ValueError):
+        message = from_json(payload)
+        if isinstance(message, dict):
+            return message
+    return {"text": payload[:_SHOWN].decode(errors="replace")}
+
+
+def _gone(client: Client, key: str) -> Message:
+    name = key.removeprefix(f"{client.keys.prefix}/")
+    with suppress(ValueError):
+        name = str(robot(name))
+    return {"robot": name, "gone": True}
+
+
+def _json(key: str, message: Message) -> str:
+    return to_json({"key": key, **message}).decode()
+
+
+def _anything(message: Message) -> bool:
+    return True
+
+
+def _of(name: str, cards: Iterable[Card]) -> Wanted:
+    """What is about one robot, under its name or its address."""
+    names = {name}
+    for card in cards:
+        if name in (card.robot, card.address):
+            names |= {card.robot, *([card.address] if card.address else [])}
+    return lambda message: not names.isdisjoint(message.get(part) for part in ("source", "destination", "robot"))

@@ -1,0 +1,264 @@
+"""What the brokers know: `psiu robots`, `links`, `routes`, `ledger`, `status` and `why`."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import click
+
+from psiu_broker.cli.commands import Failure, examples
+from psiu_broker.cli.connection import Connection, connects
+from psiu_broker.cli.output import Cell, ago, on_terminal, print_json, print_rows, print_table, printable, styled
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status, Why
+from psiu_broker.profiles.psiu import QUESTIONS
+
+Told = Sequence[tuple[str, Any]]
+"""What each broker told of a thing, by its name."""
+
+Links = Sequence[tuple[str, Link]]
+Routes = Sequence[tuple[str, Route]]
+Ledgers = Sequence[tuple[str, Ledger]]
+Rows = Sequence[tuple[str, Sequence[Cell]]]
+
+
+@click.command(epilog=examples("psiu robots", "psiu robots --json | jq '.[].robot'", "psiu robots | cut -f1"))
+@connects
+def robots(connection: Connection) -> None:
+    """List the robots that the broker knows, where they are and what they can do.
+
+    In a pipe each line has, between tabs: robot, address, protocol, link, peer, link state, last heard, frames
+    heard, commands, broker. With --json: a list of cards (psiu schema Card).
+    """
+    with connection.client() as client:
+        cards = client.cards()
+        if not cards and not client.brokers():
+            raise connection.nobody()
+    if connection.as_json:
+        print_json([card.model_dump(mode="json") for card in cards])
+    else:
+        show_robots(cards)
+
+
+@click.command(epilog=examples("psiu links", "psiu links --json | jq '.[] | select(.state != \"open\")'"))
+@connects
+def links(connection: Connection) -> None:
+    """List the links, their state, and what those that are not open wait for.
+
+    In a pipe each line has, between tabs: link, adapter, protocol, state, reason, robots, frames in, frames out,
+    malformed, queued, times reopened, peers, broker. With --json: a list (psiu schema Link).
+    """
+    told = _ask(connection, "links")
+    if connection.as_json:
+        _print_each(told)
+    else:
+        show_links([(broker, Link.model_validate(link)) for broker, found in told for link in found])
+
+
+@click.command(epilog=examples("psiu routes", "psiu routes --json"))
+@connects
+def routes(connection: Connection) -> None:
+    """List where frames for each robot go, how that was learned, and when it will be forgotten.
+
+    In a pipe each line has, between tabs: robot, link, peer, origin, age in s, expires in s, broker.
+    With --json: a list (psiu schema Route).
+    """
+    told = _ask(connection, "routes")
+    if connection.as_json:
+        _print_each(told)
+        return
+    show_routes([(broker, Route.model_validate(route)) for broker, found in told for route in found])
+
+
+@click.command(epilog=examples("psiu ledger", "psiu ledger --json | jq '.[].balances'"))
+@connects
+def ledger(connection: Connection) -> None:
+    """Show the fate of every frame: arrived = delivered + answered + dropped + waiting.
+
+    In a pipe each line has, between tabs: link, arrived, delivered, answered, dropped, waiting, reasons of the drops,
+    broker. With --json: a list with the ledger of each broker (psiu schema Ledger). The exit code is 1 if the books
+    do not balance.
+    """
+    told = _ask(connection, "ledger")
+    found = [(broker, Ledger.model_validate(each)) for broker, each in told]
+    if connection.as_json:
+        print_json([{"broker": broker, **each} for broker, each in told])
+    else:
+        show_ledger(found)
+    wrong = [broker for broker, each in found if not each.balances]
+    if wrong:
+        raise Failure(f"the books of {', '.join(wrong)} do not balance: please report it")
+
+
+@click.command(epilog=examples("psiu status", "psiu status --json | jq '.[].healthy'"))
+@connects
+def status(connection: Connection) -> None:
+    """Show how the broker itself is.
+
+    In a pipe each line has, between tabs: broker, version, seconds up, links open, links, robots, healthy, listening
+    endpoints, Zenoh id. With --json: a list (psiu schema Status, and Health in the same object).
+    """
+    with connection.client() as client:
+        statuses = client.brokers()
+        healths = client.ask("health")
+    if not statuses:
+        raise connection.nobody()
+    found = [(each, Health.model_validate(healths.get(each.broker, _UNKNOWN))) for each in statuses]
+    if connection.as_json:
+        print_json([{**each.model_dump(mode="json"), **health.model_dump(mode="json")} for each, health in found])
+    else:
+        show_status(found)
+
+
+@click.command(epilog=examples("psiu why BETA MNERIM", "psiu why base 0x12", "psiu why BETA '??' --json"))
+@click.argument("a")
+@click.argument("b")
+@connects
+def why(connection: Connection, a: str, b: str) -> None:
+    """Tell what would become of a frame from robot A to robot B now, and why.
+
+    A robot is a name, a PSIU HEXA address such as 0x12 or red.0x12, or ?? for everyone. With --json: a list with the
+    decision of each broker (psiu schema Why).
+    """
+    told = _ask(connection, "why", a, b)
+    if connection.as_json:
+        print_json([{"broker": broker, **each} for broker, each in told])
+        return
+    for _, each in told:
+        decision = Why.model_validate(each)
+        verdict = "would arrive" if decision.delivered else f"would not arrive: {decision.verdict}"
+        heading = f"{decision.a} → {decision.b} {verdict}"
+        click.echo(styled(printable(heading), fg="green" if decision.delivered else "red", bold=True))
+        for step in decision.steps:
+            click.echo(f"  {printable(step)}")
+
+
+def show_robots(cards: Sequence[Card]) -> None:
+    if on_terminal():
+        heads = ("robot", "address", "protocol", "where", "state", "last heard", "commands")
+        rows = [(card.broker, _robot(card)) for card in cards]
+        print_table(*_with_brokers(heads, rows), "No robot is known yet. Ask who is there: psiu discover")
+        return
+    print_rows(
+        (c.robot, c.address, c.protocol, c.link, c.peer, c.link_state, c.last_heard, c.frames_heard,
+         " ".join(command.name for command in c.commands), c.broker)
+        for c in cards
+    )  # fmt: skip
+
+
+def show_links(found: Links) -> None:
+    if on_terminal():
+        heads = ("link", "adapter", "protocol", "state", "robots", "in", "out", "malformed", "queued", "reopened")
+        rows = [(broker, _link(link)) for broker, link in found]
+        nothing = "The broker has no links: add [links.NAME] to its configuration."
+        print_table(*_with_brokers(heads, rows), nothing)
+        for _, link in found:
+            if link.reason:
+                click.echo(f"{link.name} is {link.state}: {printable(link.reason)}")
+        return
+    print_rows(
+        (link.name, link.adapter, link.protocol, link.state, link.reason, link.robots, link.frames_in, link.frames_out,
+         link.malformed, link.queued, link.reopened, " ".join(link.peers), broker)
+        for broker, link in found
+    )  # fmt: skip
+
+
+def show_routes(found: Routes) -> None:
+    if on_terminal():
+        heads = ("robot", "where", "origin", "heard", "forgotten in")
+        rows = [(broker, _route(route)) for broker, route in found]
+        print_table(*_with_brokers(heads, rows), "No robot has been heard yet. Ask who is there: psiu discover")
+        return
+    print_rows((r.robot, r.link, r.peer, r.origin, r.age_s, r.expires_in_s, broker) for broker, r in found)
+
+
+def show_ledger(found: Ledgers) -> None:
+    rows = [(broker, _account(account)) for broker, each in found for account in (*each.accounts, each.total)]
+    if not on_terminal():
+        print_rows((*row, broker) for broker, row in rows)
+        return
+    heads = ("link", "arrived", "delivered", "answered", "dropped", "waiting", "why dropped")
+    print_table(*_with_brokers(heads, rows), "No frame has arrived yet.")
+    for broker, each in found:
+        sums = "arrived = delivered + answered + dropped + waiting"
+        text = f"The books of {broker} balance: {sums}." if each.balances else f"The books of {broker}: {sums} FAILS."
+        click.echo(styled(printable(text), fg="green" if each.balances else "red"))
+
+
+def show_status(found: Iterable[tuple[Status, Health]]) -> None:
+    if not on_terminal():
+        rows = [
+            (
+                s.broker,
+                s.version,
+                s.uptime_s,
+                s.links_open,
+                s.links,
+                s.robots,
+                h.healthy,
+                " ".join(s.listen),
+                s.zenoh_id,
+            )
+            for s, h in found
+        ]
+        print_rows(rows)
+        return
+    for each, health in found:
+        failed = ", ".join(name for name, good in health.checks.items() if not good)
+        click.echo(styled(printable(each.broker), bold=True) + f"  psiu-broker {printable(each.version)}")
+        click.echo(f"  up since {ago(each.uptime_s)}, {each.started.astimezone():%Y-%m-%d %H:%M:%S}")
+        click.echo(f"  {each.links_open} of {each.links} links open, {each.robots} robots known")
+        click.echo(f"  programs connect to {printable(' '.join(each.listen))}")
+        well = styled("healthy", fg="green") if health.healthy else styled(f"not healthy: {failed}", fg="red")
+        click.echo(f"  {well}")
+
+
+_UNKNOWN: Final[Mapping[str, object]] = {"healthy": False, "checks": {"answers": False}}
+
+
+def _ask(connection: Connection, *what: str) -> Told:
+    with connection.client() as client:
+        told = sorted(client.ask(*what).items())
+    if not told:
+        raise connection.nobody()
+    return told
+
+
+def _print_each(told: Told) -> None:
+    print_json([{"broker": broker, **each} for broker, found in told for each in found])
+
+
+def _with_brokers(columns: Sequence[str], rows: Rows) -> tuple[Sequence[str], Sequence[Sequence[Cell]]]:
+    """Say in front of every row whose it is, where there are several brokers."""
+    if len({broker for broker, _ in rows}) < 2:
+        return columns, [row for _, row in rows]
+    return ("broker", *columns), [(broker, *row) for broker, row in rows]
+
+
+def _robot(card: Card) -> Sequence[Cell]:
+    where = _where(card.link, card.peer)
+    own = [command.name for command in card.commands if command.name not in _EVERYBODYS]
+    heard = card.last_heard or "never"
+    return card.robot, card.address, card.protocol, where, card.link_state, heard, " ".join(own)
+
+
+def _link(link: Link) -> Sequence[Cell]:
+    counts = (link.robots, link.frames_in, link.frames_out, link.malformed, link.queued, link.reopened)
+    return link.name, link.adapter, link.protocol, link.state, *counts
+
+
+def _route(route: Route) -> Sequence[Cell]:
+    heard = "never" if route.age_s is None else ago(route.age_s)
+    rest = None if route.expires_in_s is None else f"{route.expires_in_s:.0f} s"
+    return route.robot, _where(route.link, route.peer), route.origin, heard, rest
+
+
+def _where(link: str, peer: str | None) -> str:
+    return link if peer is None else f"{link}/{peer}"
+
+
+def _account(account: Account) -> Sequence[Cell]:
+    reasons = " ".join(f"{reason}={count}" for reason, count in account.dropped.items())
+    dropped = sum(account.dropped.values())
+    return account.link, account.arrived, account.delivered, account.answered, dropped, account.waiting, reasons
+
+
+_EVERYBODYS: Final = frozenset(command.name for command in QUESTIONS)
