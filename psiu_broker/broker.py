@@ -27,12 +27,15 @@ from psiu_broker.profiles import Node, describe
 from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
+from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.router import Router
 
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.1
 """How often what is too late is dropped and cards that changed are put."""
+DOUBLES_MARGIN_S: Final = 2.0
+"""A frame may wait its age limit in an outbox, and this long elsewhere, before its double is no longer known."""
 DRAIN_S: Final = 1.0
 """How long a stopping broker lets its outboxes empty."""
 REOPEN_S: Final = 2.0
@@ -51,10 +54,17 @@ class Broker:
             table.Binding(Address.named(robot.name), robot.address, Way(robot.link, robot.peer), robot.protocol)
             for robot in configuration.robots.values()
         )
-        router = Router(self._own_addresses(), bindings, identity, heard=self._robot_heard)
+        slowest_s = max((link.options.max_age_s for link in configuration.links.values()), default=0.0)
+        router = Router(
+            self._own_addresses(),
+            bindings,
+            identity,
+            self._robot_heard,
+            self._robot_gone,
+            Duplicates(slowest_s + DOUBLES_MARGIN_S),
+        )
         self.exchange = Exchange(self._own_name, router)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
-        self.exchange.withdrawn = self._robot_gone
         self.report = Report(configuration.broker.name, self.exchange, self.resident.commands)
         for link in configuration.links.values():
             self.exchange.add(self._link(link))
@@ -188,15 +198,13 @@ class Broker:
         own = {self._own_name: "psiu-ascii"}
         for link in self.configuration.links.values():
             if isinstance(link.codec, PsiuHexa.Options):
-                for number in (self.configuration.broker.address, link.codec.local):
-                    own[Address.numbered(number, link.codec.domain)] = "psiu-hexa"
+                own[Address.numbered(link.codec.local, link.codec.domain)] = "psiu-hexa"
         return own
 
     def _directory(self, domain: str) -> Directory:
         directory = self._directories.get(domain)
         if directory is None:
-            directory = Directory({str(self._own_name)}, {self.configuration.broker.address})
-            self._directories[domain] = directory
+            directory = self._directories[domain] = Directory({str(self._own_name)})
         return directory
 
     def _link(self, configuration: LinkConfiguration) -> Link:
@@ -229,7 +237,7 @@ class Broker:
                 try:
                     await self._open_bus()
                 except BusError as error:
-                    log.error("the bus cannot be opened again: %s; trying on", error)
+                    log.warning("the bus cannot be opened again: %s; trying on", error)
                     await asyncio.sleep(REOPEN_S)
 
     async def _tick(self) -> None:
@@ -248,7 +256,7 @@ class Broker:
             await asyncio.sleep(TICK_S)
 
     def _checks(self) -> dict[str, bool]:
-        links = {f"link {task.get_name()}": not task.done() for task in self._link_tasks}
+        links = {task.get_name(): not task.done() for task in self._link_tasks}
         return {
             "loop": time.monotonic() - self._ticked < 10 * TICK_S + ROUND_TRIP_S,
             "bus": self._bus is not None and not self._bus.session.is_lost,
@@ -263,7 +271,7 @@ class Broker:
                 self._bus is not None and await self._bus.queries.round_trip(ROUND_TRIP_S) < ROUND_TRIP_S
             )
         except BusError as error:
-            log.error("health: %s", error)
+            log.warning("health: %s", error)
             checks["zenoh round trip"] = False
         if not all(checks.values()):
             log.error("not healthy: %s", ", ".join(name for name, good in checks.items() if not good))

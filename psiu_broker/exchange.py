@@ -7,17 +7,17 @@ from math import inf
 from typing import Literal, Protocol, cast
 
 from psiu_broker.codecs import psiu_ascii
+from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate
-from psiu_broker.routing.router import SELF, Decision, Port, Router
-from psiu_broker.routing.table import Route
+from psiu_broker.routing.router import DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
 from psiu_broker.routing.verdicts import (
     ANSWERED,
     DELIVERED,
-    DUPLICATE,
+    EXPIRED,
     MALFORMED,
     NO_ROUTE,
     Account,
@@ -93,10 +93,9 @@ class Exchange:
         self.router = router
         self.holding = holding or Holding()
         self.resident: Resident
-        self.withdrawn: Callable[[Route], None] = lambda _: None
-        """Told of each route that is no more."""
         self._ports: dict[str, Port] = {}
         self._route_age_s: dict[str, float] = {}
+        self._max_age_s: dict[str, float] = {}
         self._own_name = own_name
         self._wall_clock = wall_clock
         self._route = router.route
@@ -108,6 +107,7 @@ class Exchange:
         options = link.configuration.options
         self._ports[link.name] = Port(link.name, link.configuration.protocol, link.ways, options.wildcard)
         self._route_age_s[link.name] = options.route_age_s
+        self._max_age_s[link.name] = options.max_age_s
 
     def heard(self, frame: Frame, way: Way, now: float, patience_s: float = inf) -> Verdict | None:
         """A frame from a robot (or, by the way SELF, from the broker): decide, move, count, tell the bus.
@@ -119,17 +119,17 @@ class Exchange:
         bus = self.bus
         decision = self._route(frame, way, now)
         hops = decision.hops
+        if bus.listened and decision is not DOUBLE and decision is not IMPOSSIBLE_SOURCE:
+            bus.publish(frame if frame.wire else self._written(frame, hops), way, self._wall_clock())
         if decision.action == "forward" and len(hops) == 1:
-            hop = hops[0]
-            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, patience_s)
+            link, peer = hops[0]
+            verdict = self.links[link].offer(frame, peer, way, now, patience_s)
         else:
-            verdict = self._carry_out(decision, frame, way, now)
+            verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
             account.fates[verdict] += 1
             if bus.raw_listened:
                 self._tap("in", way, verdict, frame)
-        if bus.listened and verdict is not DUPLICATE:
-            bus.publish(frame, way, self._wall_clock())
         return verdict
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
@@ -172,17 +172,24 @@ class Exchange:
         self.resident.link_opened(link, now)
 
     def closed(self, link: Link, now: float) -> None:
-        self._withdraw(self.router.link_down(link.name, now))
+        self.router.link_down(link.name, now)
         self.resident.link_closed(link, now)
 
     def peer_lost(self, way: Way, now: float) -> None:
-        self._withdraw(self.router.peer_lost(way, now))
+        self.router.peer_lost(way, now)
 
     def release(self, robot: Address, now: float) -> None:
         """`robot` has been heard: move the frames that waited for it."""
         for held in self.holding.release(robot):
             decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
-            verdict = NO_ROUTE if decision.action == "ask" else self._carry_out(decision, held.frame, held.arrived, now)
+            patience_s = min((self._max_age_s[hop.link] for hop in decision.hops), default=inf) - (now - held.since)
+            verdict: Verdict | None
+            if decision.action == "ask":
+                verdict = NO_ROUTE
+            elif patience_s <= 0:
+                verdict = EXPIRED
+            else:
+                verdict = self._carry_out(decision, held.frame, held.arrived, now, patience_s)
             if verdict is not None:
                 self.settled(Fate(held.frame, held.arrived), verdict, now)
 
@@ -192,7 +199,7 @@ class Exchange:
             self.settled(Fate(held.frame, held.arrived), NO_ROUTE, now)
         for link in self.links.values():
             link.expire(now)
-        self._withdraw(self.router.table.age(self._route_age_s, now))
+        self.router.table.age(self._route_age_s, now)
 
     def waiting(self) -> dict[str, int]:
         """How many of the frames that arrived on each link wait now, in an outbox or for a route."""
@@ -201,10 +208,6 @@ class Exchange:
         for fate in fates.values():
             counts[fate.arrived.link] += 1
         return counts
-
-    def _withdraw(self, routes: Iterable[Route]) -> None:
-        for route in routes:
-            self.withdrawn(route)
 
     def _tap(self, direction: Literal["in", "out"], way: Way, verdict: Verdict, what: Frame | Malformed) -> None:
         if not self.bus.tapped(way.link):
@@ -226,12 +229,12 @@ class Exchange:
             )
         )
 
-    def _carry_out(self, decision: Decision, frame: Frame, way: Way, now: float) -> Verdict | None:
+    def _carry_out(self, decision: Decision, frame: Frame, way: Way, now: float, patience_s: float) -> Verdict | None:
         match decision.action:
             case "forward":
-                return self._spread(frame, decision.hops, way, now)
+                return self._spread(frame, decision.hops, way, now, patience_s)
             case "flood":
-                return self._flood(frame, decision.hops, way, now)
+                return self._flood(frame, decision.hops, way, now, patience_s)
             case "answer":
                 self.resident.answer(frame, way, now)
                 return ANSWERED
@@ -242,23 +245,33 @@ class Exchange:
             case "drop":
                 return decision.verdict
 
-    def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
+    def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float) -> Verdict | None:
         if way is not SELF:
             self.resident.answer(frame, way, now)
         if hops:
-            return self._spread(frame, hops, way, now)
+            return self._spread(frame, hops, way, now, patience_s)
         return NO_ROUTE if way is SELF else ANSWERED
 
-    def _spread(self, frame: Frame, hops: Iterable[Way], way: Way, now: float) -> Verdict | None:
+    def _spread(
+        self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float = inf
+    ) -> Verdict | None:
         """Send copies several ways; the verdict of the whole, None while a copy waits."""
-        hops = list(hops)
         fate = Fate(frame, way, len(hops))
         final: Verdict | None = None
         for hop in hops:
-            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, fate=fate)
+            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, patience_s, fate)
             if verdict is not None:
                 final = fate.settle(verdict)
         return final
+
+    def _written(self, frame: Frame, hops: tuple[Way, ...]) -> Frame:
+        """`frame`, which is our own, with the bytes that its first hop will carry."""
+        for hop in hops:
+            try:
+                return frame._replace(wire=self.links[hop.link].codec.encode(frame))
+            except EncodeError:
+                break
+        return frame
 
     def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
         """Hold a frame for an unknown robot, and ask for the robot by its name, once."""
@@ -276,8 +289,8 @@ class Exchange:
         self.resident.asked_names(hops, now)
         account = self.accounts[SELF.link]
         account.arrived += 1
+        if self.bus.listened:
+            self.bus.publish(self._written(frame, hops), SELF, self._wall_clock())
         verdict = self._spread(frame, hops, SELF, now) if hops else NO_ROUTE
         if verdict is not None:
             account.fates[verdict] += 1
-        if self.bus.listened:
-            self.bus.publish(frame, SELF, self._wall_clock())

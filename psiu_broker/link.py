@@ -18,7 +18,7 @@ from psiu_broker.codecs.avr import avr_trouble
 from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration
 from psiu_broker.errors import EncodeError, LinkError
-from psiu_broker.frame import Frame, Malformed, Way
+from psiu_broker.frame import Address, Frame, Malformed, Way
 from psiu_broker.routing.askers import Askers
 from psiu_broker.routing.outbox import Fate, Outbox, Parcel, lane
 from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, Verdict
@@ -29,6 +29,7 @@ FIRST_PAUSE_S: Final = 0.25
 LONGEST_PAUSE_S: Final = 15.0
 SHORTEST_PAUSE_S: Final = 0.05
 """Between two attempts, whatever the adapter says has changed."""
+WARNED_KEPT: Final = 256
 
 log = logging.getLogger(__name__)
 
@@ -56,12 +57,13 @@ class Hub(Protocol):
 class _End:
     """One far end of the link: its way, its stream's codec, and the clock of its silence."""
 
-    __slots__ = ("codec", "last", "timer", "way")
+    __slots__ = ("codec", "last", "silence_s", "timer", "way")
 
     def __init__(self, way: Way, codec: Codec) -> None:
         self.way = way
         self.codec = codec
         self.last = 0.0
+        self.silence_s = 0.0
         self.timer: asyncio.TimerHandle | None = None
 
 
@@ -93,6 +95,7 @@ class Link:
         self._askers = Askers() if unaddressed else None
         self._make_codec = codec
         self._hub = hub
+        self._warned: set[Address] = set()
         self._avr_limits = configuration.options.avr_limits
         self._max_age_s = configuration.options.max_age_s
         self._clock = clock
@@ -115,8 +118,7 @@ class Link:
                 events = [*events, *codec.flush(now)]
             else:
                 end.last = now
-                if end.timer is None:
-                    self._watch_silence(end, codec.silence_s)
+                self._watch_silence(end, codec.silence_s)
         self._take(events, end.way, now)
 
     def writable(self) -> None:
@@ -124,22 +126,21 @@ class Link:
         self.expire(now)
         while self._transport is not None and (parcel := self.outbox.take()) is not None:
             if self._transport.write(parcel.wire, parcel.peer):
-                self.frames_out += 1
-                if self._hub.bus.raw_listened:
-                    self._hub.sent(parcel.fate.frame, parcel.wire, Way(self.name, parcel.peer))
+                self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
                 self.outbox.put_back(parcel)
                 return
             else:
                 self._hub.settled(parcel.fate, LINK_DOWN, now)
-        self._empty.set()
+        self._note_empty()
 
     def peer_lost(self, peer: Peer) -> None:
         now = self._clock()
         end = self._ends.pop(peer, None)
         for parcel in self.outbox.remove_peer(peer):
             self._hub.settled(parcel.fate, LINK_DOWN, now)
+        self._note_empty()
         if end is not None:
             if end.timer is not None:
                 end.timer.cancel()
@@ -177,14 +178,10 @@ class Link:
             except EncodeError as error:
                 log.debug("%s: %s", self.name, error)
                 return REFUSED
-        if self._askers is not None:
-            self._askers.note(frame.destination, frame.source, now)
         if self._avr_limits:
             self._warn_of_avr(frame, wire)
         if not self.outbox.size and transport.write(wire, peer):
-            self.frames_out += 1
-            if self._hub.bus.raw_listened:
-                self._hub.sent(frame, wire, Way(self.name, peer))
+            self._sent(frame, wire, peer, now)
             return DELIVERED
         if self._transport is None:
             return LINK_DOWN
@@ -208,6 +205,7 @@ class Link:
         if self.outbox.size:
             for parcel in self.outbox.expire(now):
                 self._hub.settled(parcel.fate, EXPIRED, now)
+            self._note_empty()
 
     def details(self) -> dict[str, str | int | float]:
         return {} if self._transport is None else dict(self._transport.status())
@@ -216,26 +214,36 @@ class Link:
         """Keep the link open for ever: what fails waits and is tried again. Ends only when cancelled."""
         try:
             while True:
-                self._lost = asyncio.get_running_loop().create_future()
-                self._set_state("opening", self.reason)
                 try:
-                    transport = await self.adapter.open(self)
+                    await self._live()
                 except LinkError as error:
                     self._set_state("waiting", str(error))
                 except Exception as error:  # an adapter's own mistake must not reach another link
                     log.exception("link %s: its adapter failed", self.name)
                     self._set_state("waiting", f"its adapter failed: {error!r}")
-                else:
-                    try:
-                        if not self._lost.done():
-                            self.connected(transport)
-                        await self._lost
-                    finally:
-                        self._down("closed")
-                        await transport.close()
                 await self._pause()
         finally:
             self._set_state("closed", None)
+
+    async def _live(self) -> None:
+        """Open the link once, and serve it until it is lost.
+
+        Raises:
+            LinkError: it cannot be opened, or was lost; the text says why.
+        """
+        self._lost = asyncio.get_running_loop().create_future()
+        self._set_state("opening", self.reason)
+        transport = await self.adapter.open(self)
+        try:
+            if not self._lost.done():
+                self.connected(transport)
+            raise await self._lost
+        finally:
+            self._down("closed")
+            try:
+                await transport.close()
+            except Exception:  # it must not hide why the link ends, least of all that it was told to
+                log.exception("link %s: its adapter failed to close", self.name)
 
     async def drained(self) -> None:
         """Return when nothing waits to be sent."""
@@ -244,8 +252,22 @@ class Link:
 
     # Inside.
 
+    def _sent(self, frame: Frame, wire: bytes, peer: Peer, now: float) -> None:
+        self.frames_out += 1
+        if self._askers is not None:
+            self._askers.note(frame.destination, frame.source, now)
+        if self._hub.bus.raw_listened:
+            self._hub.sent(frame, wire, Way(self.name, peer))
+
+    def _note_empty(self) -> None:
+        if not self.outbox.size:
+            self._empty.set()
+
     def _take(self, events: Sequence[Event], way: Way, now: float) -> None:
+        ends = self._ends
         for event in events:
+            if self._ends is not ends:
+                return  # The link went down at an earlier frame; the rest must not teach routes to it.
             if isinstance(event, Frame):
                 self.frames_in += 1
                 self.last_heard = now
@@ -261,7 +283,9 @@ class Link:
 
     def _warn_of_avr(self, frame: Frame, wire: bytes) -> None:
         trouble = avr_trouble(wire) if frame.protocol == "psiu-ascii" else None
-        if trouble is not None:
+        if trouble is not None and frame.destination not in self._warned:
+            if len(self._warned) < WARNED_KEPT:
+                self._warned.add(frame.destination)
             log.warning("link %s: %s may not understand %s: %s", self.name, frame.destination, frame.subject, trouble)
 
     def _end(self, peer: Peer) -> _End:
@@ -270,6 +294,12 @@ class Link:
         return end
 
     def _watch_silence(self, end: _End, silence_s: float) -> None:
+        """Have `_silence` called after `silence_s`, or sooner if it was to be sooner and nothing changed."""
+        if end.timer is not None:
+            if end.silence_s == silence_s:
+                return
+            end.timer.cancel()
+        end.silence_s = silence_s
         end.timer = asyncio.get_running_loop().call_later(silence_s, self._silence, end)
 
     def _silence(self, end: _End) -> None:
@@ -293,7 +323,7 @@ class Link:
         for end in self._ends.values():
             if end.timer is not None:
                 end.timer.cancel()
-        self._ends.clear()
+        self._ends = {}
         if self.adapter.datagrams:
             self.codec = self._make_codec()
         for parcel in self.outbox.clear():

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from typing import ClassVar
 
-from pydantic import BaseModel, PrivateAttr
+from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from psiu_broker.adapter import Adapter, Peer, Receiver, Transport
 from psiu_broker.codecs import CODECS
@@ -41,14 +41,17 @@ class MemoryTransport(Transport):
 class MemoryAdapter(Adapter):
     """Opens a `MemoryTransport`, unless told to fail."""
 
+    model_config = ConfigDict(frozen=False)
+
     ends: tuple[Peer, ...] = (None,)
+    transport_class: type[MemoryTransport] = MemoryTransport
     _transports: list[MemoryTransport] = PrivateAttr(default_factory=list)
     _failure: list[Exception] = PrivateAttr(default_factory=list)
 
     async def open(self, receiver: Receiver) -> MemoryTransport:
         if self._failure:
             raise self._failure[0]
-        transport = MemoryTransport(self.ends)
+        transport = self.transport_class(self.ends)
         self._transports.append(transport)
         return transport
 

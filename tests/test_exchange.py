@@ -187,6 +187,61 @@ def test_a_robot_that_does_not_answer_to_its_name_has_no_route(world: World) -> 
     world.balances()
 
 
+def test_the_time_spent_waiting_for_a_route_counts_towards_the_age_limit(world: World) -> None:
+    world.transports["second"].full = True
+    world.links["wifi"].received(wire("PC", "MNERIM", "parafrente", "100"), PEERS[0])
+    world.now += 0.4
+    world.links["second"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.now += 1.7
+    world.transports["second"].full = False
+    world.links["second"].writable()
+    assert world.wires("second") == []
+    assert world.verdicts("wifi") == {"expired": 1}
+    world.balances()
+
+
+def test_a_callers_patience_holds_on_every_way_to_a_robot_that_is_sought(world: World) -> None:
+    world.exchange.router.table.learn(Address.named("SOUGHT"), Way("wifi"), "psiu-ascii", world.now)
+    world.transports["wifi"].full = True
+    command = psiu_ascii.message(BASE, Address.named("SOUGHT"), "parafrente", "1")
+    assert world.exchange.send(command, world.now, 0.3) is None
+    world.now += 0.4
+    world.transports["wifi"].full = False
+    world.links["wifi"].writable()
+    assert world.wires("wifi") == []
+    assert world.resident.undelivered_frames == [(command, "expired")]
+
+
+def test_an_answer_goes_to_who_was_heard_by_the_robot_not_to_who_only_tried() -> None:
+    world = World()
+    world._add("field", MemoryAdapter(), "psiu-hexa", topology="ad-hoc")
+    world.connect("arm", "field")
+    plain = codec_of(configuration(protocol="psiu-hexa"))
+    arm = Address.numbered(0x12)
+    world.links["field"].received(plain.encode(psiu_hexa.packet(Address.numbered(3), arm, b"\x04\x01")), None)
+    world.transports["arm"].full = True
+    world.links["field"].received(plain.encode(psiu_hexa.packet(Address.numbered(7), arm, b"\x04\x09")), None)
+    world.links["arm"].received(arm_says(b"A"), None)
+    assert world.wires("field") == [plain.encode(psiu_hexa.packet(arm, Address.numbered(3), b"A"))]
+
+
+def test_who_passes_for_the_broker_is_not_published(world: World) -> None:
+    bus = world.exchange.bus = Bus()
+    world.links["radio"].received(wire("base", "MNERIM", "parafrente", "9"), None)
+    assert world.verdicts("radio") == {"refused": 1}
+    assert bus.frames == []
+    assert [raw.verdict for raw in bus.raw] == ["refused"]
+
+
+def test_the_brokers_own_frames_are_published_with_the_bytes_that_left(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    bus = world.exchange.bus = Bus()
+    world.exchange.send(psiu_ascii.message(BASE, Address.named("MNERIM"), "parafrente", "1"), world.now)
+    arm = psiu_hexa.packet(Address.numbered(0), Address.numbered(0x12), b"")
+    world.exchange.send(arm, world.now)
+    assert [frame.wire for frame in bus.frames] == [world.wires("radio")[-1], world.wires("arm")[-1]]
+
+
 def test_a_question_to_everyone_goes_to_all_others_and_is_answered_here_too(world: World) -> None:
     question = wire("PC", "??", "qualseunome")
     world.links["wifi"].received(question, PEERS[0])
@@ -291,7 +346,6 @@ class FramesAreConserved(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:
         self.world = World()
-        self.offered = 0
 
     def _peer(self, name: str, second: bool) -> object:
         return PEERS[second] if name == "wifi" else None

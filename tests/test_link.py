@@ -245,6 +245,21 @@ async def test_half_a_frame_on_a_stream_is_given_up_after_silence(hub: Hub) -> N
     assert len(hub.frames) == 1
 
 
+async def test_a_codec_that_becomes_impatient_is_asked_sooner(hub: Hub) -> None:
+    link = connected(hub, MemoryTransport(), clock=time.monotonic, codec={"silence_ms": 60_000})
+    link.received(b"PC 999 lixo " + COMMAND[:10], None)
+    link.received(COMMAND[10:], None)
+    await hub.until(lambda: hub.frames)
+    assert hub.frames[0][0].source == PC
+
+
+async def test_what_comes_behind_the_frame_that_ended_the_link_is_not_heard(hub: Hub) -> None:
+    link = connected(hub, MemoryTransport())
+    hub.heard = lambda frame, way, now: hub.frames.append((frame, way)) or link.lost(LinkLost("gone"))  # type: ignore[func-returns-value, method-assign]
+    link.received(COMMAND + COMMAND, None)
+    assert len(hub.frames) == 1
+
+
 async def test_an_answer_without_a_destination_is_for_whom_the_robot_was_last_addressed_by(hub: Hub) -> None:
     made = configuration("arm", "psiu-hexa", codec={"topology": "point-to-point", "remote": 0x12, "local": 0})
     link = Link(made, lambda: codec_of(made), hub, unaddressed=True)
@@ -316,6 +331,23 @@ async def test_a_lost_link_comes_back_by_itself(hub: Hub) -> None:
         await hub.until(lambda: hub.events == ["opened", "closed", "opened"])
         assert first.closed
         assert adapter.openings == link.opened == 2
+
+
+async def test_a_transport_that_cannot_be_closed_does_not_end_the_link(
+    hub: Hub, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Stuck(MemoryTransport):
+        async def close(self) -> None:
+            raise OSError(5, "EIO")
+
+    adapter = MemoryAdapter(transport_class=Stuck)
+    link = make(hub, adapter)
+    async with running(link):
+        await hub.until(lambda: hub.events == ["opened"])
+        link.lost(LinkLost("unplugged"))
+        await hub.until(lambda: hub.events == ["opened", "closed", "opened"])
+        adapter.transport_class = MemoryTransport
+    assert "EIO" in caplog.text
 
 
 async def test_an_adapter_that_breaks_its_word_is_tried_again_and_stops_nothing(

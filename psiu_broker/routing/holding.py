@@ -8,7 +8,7 @@ from psiu_broker.frame import Address, Frame, Way
 class Held(NamedTuple):
     frame: Frame
     arrived: Way
-    expires: float
+    since: float
 
 
 class Holding:
@@ -25,9 +25,6 @@ class Holding:
         self._held: dict[Address, list[Held]] = {}
         self._size = 0
 
-    def __len__(self) -> int:
-        return self._size
-
     def waiting_from(self, link: str) -> int:
         """How many of the held frames arrived on `link`."""
         return sum(held.arrived.link == link for frames in self._held.values() for held in frames)
@@ -40,7 +37,7 @@ class Holding:
         """Keep `frame`; False when the room is full or too many others are being asked for."""
         if self._size >= self._capacity or (len(self._held) >= self._asks and not self.asked(frame.destination)):
             return False
-        self._held.setdefault(frame.destination, []).append(Held(frame, arrived, now + self._hold_s))
+        self._held.setdefault(frame.destination, []).append(Held(frame, arrived, now))
         self._size += 1
         return True
 
@@ -55,14 +52,11 @@ class Holding:
         expired: list[Held] = []
         for destination in list(self._held):
             frames = self._held[destination]
-            late = [held for held in frames if held.expires <= now]
+            late = [held for held in frames if held.since + self._hold_s <= now]
             if late:
                 expired += late
-                frames[:] = [held for held in frames if held.expires > now]
+                frames[:] = frames[len(late) :]
             if not frames:
                 del self._held[destination]
         self._size -= len(expired)
         return expired
-
-    def clear(self) -> list[Held]:
-        return self.expire(float("inf"))

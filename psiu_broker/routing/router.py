@@ -33,8 +33,8 @@ class Decision(NamedTuple):
     verdict: Verdict | None = None
 
 
-_DOUBLE: Final = Decision("drop", verdict=DUPLICATE)
-_IMPOSSIBLE_SOURCE: Final = Decision("drop", verdict=REFUSED)
+DOUBLE: Final = Decision("drop", verdict=DUPLICATE)
+IMPOSSIBLE_SOURCE: Final = Decision("drop", verdict=REFUSED)
 _ANSWER: Final = Decision("answer")
 
 
@@ -57,6 +57,7 @@ class Router:
         bindings: the robots of the configuration.
         identity: a frame's bytes in one form for all links, so that a double is known by them.
         heard: called when a robot is heard for the first time or from a new way.
+        withdrawn: called when the route to a robot is given up.
     """
 
     def __init__(
@@ -65,9 +66,10 @@ class Router:
         bindings: tuple[Binding, ...],
         identity: Callable[[Frame], Hashable],
         heard: Callable[[Route], None] = lambda _: None,
+        withdrawn: Callable[[Route], None] = lambda _: None,
         duplicates: Duplicates | None = None,
     ) -> None:
-        self.table = Table(bindings)
+        self.table = Table(bindings, withdrawn)
         self._routes = self.table.routes
         for address, protocol in own.items():
             route = Route((address,), SELF, protocol, pinned=True)
@@ -81,13 +83,13 @@ class Router:
     def route(self, frame: Frame, arrived: Way, now: float) -> Decision:
         """Decide for a frame that arrived, and learn from it."""
         if self._is_double(self._identity(frame), arrived, now):
-            return _DOUBLE
+            return DOUBLE
         source = self._routes.get(frame.source)
         if source is not None and source.way is arrived:
             source.heard_at = now
             source.frames += 1
         elif not self._learn(frame, source, arrived, now):
-            return _IMPOSSIBLE_SOURCE
+            return IMPOSSIBLE_SOURCE
         target = self._routes.get(frame.destination)
         if target is not None and target.protocol == frame.protocol and target.way != arrived:
             decision = target.decision
@@ -122,24 +124,20 @@ class Router:
             if route.way.link == port.link:
                 self._refresh(route)
 
-    def link_down(self, link: str, now: float) -> list[Route]:
-        """Withdraw what was learned on `link`; the routes withdrawn."""
+    def link_down(self, link: str, now: float) -> None:
+        """Withdraw what was learned on `link`."""
         self._ports.pop(link, None)
         for route in self.table:
             if route.way.link == link:
                 route.decision = None
-        return self.table.forget_link(link, now)
+        self.table.forget_link(link, now)
 
-    def peer_lost(self, way: Way, now: float) -> list[Route]:
-        """Withdraw the routes over a far end that is gone; the routes withdrawn."""
-        withdrawn = self.table.forget_way(way, now)
+    def peer_lost(self, way: Way, now: float) -> None:
+        """Withdraw the routes over a far end that is gone."""
+        self.table.forget_way(way, now)
         for route in self.table:
             if route.way.link == way.link:
                 self._refresh(route)
-        return withdrawn
-
-    def is_up(self, link: str) -> bool:
-        return link in self._ports
 
     def find(self, address: Address) -> Route | None:
         return self._routes.get(address)
@@ -169,8 +167,9 @@ class Router:
         route.decision = Decision("forward", (route.way,)) if known else None
 
     def _ways_to(self, target: Route) -> Collection[Way]:
-        """The robot's own way; every way of its link while nobody knows which is the robot's."""
-        return self._ports[target.way.link].ways() if target.way.peer is None else (target.way,)
+        """The robot's own way, if it is there; every way of its link while nobody knows which is the robot's."""
+        ways = self._ports[target.way.link].ways()
+        return ways if target.way.peer is None else tuple(way for way in ways if way == target.way)
 
     def _everyone(self, protocol: str, arrived: Way) -> tuple[Way, ...]:
         return tuple(

@@ -1,6 +1,6 @@
 """Who was heard where, and when."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from psiu_broker.frame import Address, Way
@@ -53,10 +53,16 @@ class Departed(NamedTuple):
 class Table:
     """Routes by address, bounded; a robot with a name and a number has one route under both."""
 
-    def __init__(self, bindings: tuple[Binding, ...] = (), *, capacity: int = 4096) -> None:
+    def __init__(
+        self,
+        bindings: tuple[Binding, ...] = (),
+        withdrawn: Callable[[Route], None] = lambda _: None,
+        *,
+        capacity: int = 4096,
+    ) -> None:
+        """`withdrawn` is told of each route that is no more."""
         self.routes: dict[Address, Route] = {}
-        self.refused = 0
-        """Robots that were not learned because the table was full."""
+        self._withdrawn = withdrawn
         self._capacity = capacity
         self._departed: dict[Address, Departed] = {}
         for binding in bindings:
@@ -67,20 +73,20 @@ class Table:
         return (route for address, route in self.routes.items() if route.addresses[0] == address)
 
     def learn(self, address: Address, way: Way, protocol: str, now: float) -> Route | None:
-        """Note that `address` was heard on `way`; None when the table is full or the route is pinned elsewhere.
+        """Note that `address` was heard on `way`; None when its route is pinned elsewhere.
 
         The newest checked frame wins: a robot that moved is followed. A robot of the configuration
-        keeps its link, but its peer on that link is learned.
+        keeps its link and, where the configuration names one, its peer. When the table is full, the
+        robot that has been known for longest gives way; if it is there, its next frame brings it back.
         """
         route = self.routes.get(address)
         if route is None:
             if len(self.routes) >= self._capacity:
-                self.refused += 1
-                return None
+                self._withdraw([next(route for route in self.routes.values() if not route.pinned)], now)
             route = Route((address,), way, protocol, pinned=False)
             self._enter(route)
             self._departed.pop(address, None)
-        elif route.pinned and route.way.link != way.link:
+        elif route.pinned and way != route.home and (route.home.peer is not None or way.link != route.home.link):
             return None
         route.way = way
         route.protocol = protocol
@@ -90,17 +96,17 @@ class Table:
             route.first_heard = now
         return route
 
-    def forget_link(self, link: str, now: float) -> list[Route]:
+    def forget_link(self, link: str, now: float) -> None:
         """Withdraw what was learned on `link`; pinned routes stay, to say that their link is down."""
-        return self._forget([route for route in self if route.way.link == link], now)
+        self._forget([route for route in self if route.way.link == link], now)
 
-    def forget_way(self, way: Way, now: float) -> list[Route]:
+    def forget_way(self, way: Way, now: float) -> None:
         """Withdraw what was learned by `way`."""
-        return self._forget([route for route in self if route.way == way], now)
+        self._forget([route for route in self if route.way == way], now)
 
-    def age(self, limit_s: dict[str, float], now: float) -> list[Route]:
+    def age(self, limit_s: Mapping[str, float], now: float) -> None:
         """Withdraw the learned routes not heard for their link's `limit_s`."""
-        return self._withdraw(
+        self._withdraw(
             [
                 route
                 for route in self
@@ -116,18 +122,18 @@ class Table:
         for address in route.addresses:
             self.routes[address] = route
 
-    def _forget(self, routes: list[Route], now: float) -> list[Route]:
+    def _forget(self, routes: list[Route], now: float) -> None:
         for route in routes:
             if route.pinned:
                 route.way = route.home
-        return self._withdraw([route for route in routes if not route.pinned], now)
+        self._withdraw([route for route in routes if not route.pinned], now)
 
-    def _withdraw(self, routes: list[Route], now: float) -> list[Route]:
+    def _withdraw(self, routes: list[Route], now: float) -> None:
         for route in routes:
             for address in route.addresses:
                 del self.routes[address]
                 self._departed.pop(address, None)
                 self._departed[address] = Departed(route.way.link, now)
+            self._withdrawn(route)
         while len(self._departed) > self._capacity:
             del self._departed[next(iter(self._departed))]
-        return routes

@@ -24,10 +24,16 @@ def test_a_double_of_the_second_press_is_still_a_double_whichever_copy_comes_fir
     assert passed == [0.0, 0.21, 0.41]
 
 
-def test_two_peers_of_one_link_are_two_ways() -> None:
-    duplicates = Duplicates(1.0)
+def test_two_peers_of_one_link_are_two_ways_for_a_moment() -> None:
+    duplicates = Duplicates(1.0, same_link_s=0.25)
     assert not duplicates.is_double(b"frame", WIFI, 0.0)
-    assert duplicates.is_double(b"frame", Way("wifi", ("127.0.0.1", 9002)), 0.1)
+    assert duplicates.is_double(b"frame", Way("wifi", ("127.0.0.1", 9002)), 0.2)
+
+
+def test_a_program_that_sends_each_command_from_a_new_port_may_repeat_itself() -> None:
+    duplicates = Duplicates(1.0, same_link_s=0.25)
+    passed = [duplicates.is_double(b"frame", Way("wifi", ("127.0.0.1", port)), port * 0.3) for port in range(5)]
+    assert not any(passed)
 
 
 def test_after_the_window_another_way_may_bring_it() -> None:

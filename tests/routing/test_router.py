@@ -29,12 +29,18 @@ def heard() -> list[Route]:
 
 
 @pytest.fixture
-def router(heard: list[Route]) -> Router:
+def gone() -> list[Route]:
+    return []
+
+
+@pytest.fixture
+def router(heard: list[Route], gone: list[Route]) -> Router:
     router = Router(
         {BASE: "psiu-ascii", BROKER_NUMBER: "psiu-hexa"},
         (Binding(BRACO, ARM_NUMBER, ARM, "psiu-hexa"),),
         identity=wire,
         heard=heard.append,
+        withdrawn=gone.append,
     )
     router.link_up(Port("radio", "psiu-ascii", lambda: (RADIO,)))
     router.link_up(Port("wifi", "psiu-ascii", lambda: (PHONE, LAPTOP)))
@@ -112,10 +118,10 @@ def test_without_anybody_to_ask_there_is_no_route(router: Router) -> None:
     assert router.decide(MNERIM, "psiu-ascii", PHONE).verdict == "no_route"
 
 
-def test_what_a_lost_link_taught_is_forgotten_and_its_robots_are_named(router: Router) -> None:
+def test_what_a_lost_link_taught_is_forgotten_and_its_robots_are_named(router: Router, gone: list[Route]) -> None:
     router.route(text(MNERIM, BASE), RADIO, 0.0)
-    withdrawn = router.link_down("radio", 5.0)
-    assert [route.robot for route in withdrawn] == [MNERIM]
+    router.link_down("radio", 5.0)
+    assert [route.robot for route in gone] == [MNERIM]
     assert router.find(MNERIM) is None
     departed = router.table.departed(MNERIM)
     assert departed is not None
@@ -130,11 +136,12 @@ def test_only_the_robots_of_a_lost_peer_are_forgotten(router: Router) -> None:
     assert router.find(MNERIM) is not None
 
 
-def test_routes_age_by_the_limit_of_their_link(router: Router) -> None:
+def test_routes_age_by_the_limit_of_their_link(router: Router, gone: list[Route]) -> None:
     router.route(text(MNERIM, BASE), RADIO, 0.0)
     router.route(text(PC, BASE), PHONE, 0.0)
     limits = {"radio": 10.0, "wifi": 100.0, "arm": 100.0}
-    assert [route.robot for route in router.table.age(limits, 50.0)] == [MNERIM]
+    router.table.age(limits, 50.0)
+    assert [route.robot for route in gone] == [MNERIM]
     assert router.find(BRACO) is not None
 
 
@@ -186,12 +193,26 @@ def test_two_domains_may_use_the_same_number() -> None:
     assert router.decide(blue, "psiu-hexa", SELF).hops == (Way("blue"),)
 
 
-def test_the_table_is_bounded_and_says_how_many_it_turned_away() -> None:
-    table = Table(capacity=10)
+def test_a_configured_peer_that_the_link_does_not_have_is_not_reached_and_nobody_can_take_its_place() -> None:
+    binding = Binding(MNERIM, None, PHONE, "psiu-ascii")
+    router = Router({BASE: "psiu-ascii"}, (binding,), identity=wire)
+    there = [LAPTOP]
+    router.link_up(Port("wifi", "psiu-ascii", lambda: there))
+    assert router.route(text(BASE, MNERIM), SELF, 0.0).verdict == "link_down"
+    router.route(text(MNERIM, BASE), LAPTOP, 1.0)
+    assert router.route(text(BASE, MNERIM), SELF, 2.0).verdict == "link_down"
+    there.append(PHONE)
+    assert router.route(text(BASE, MNERIM), SELF, 3.0).hops == (PHONE,)
+
+
+def test_a_full_table_makes_room_for_a_new_robot_and_never_forgets_a_configured_one() -> None:
+    gone: list[Route] = []
+    table = Table((Binding(BRACO, ARM_NUMBER, ARM, "psiu-hexa"),), gone.append, capacity=10)
     for number in range(25):
         table.learn(Address.named(f"R{number}"), RADIO, "psiu-ascii", 0.0)
-    assert len(list(table)) == 10
-    assert table.refused == 15
+    assert len(table.routes) == 10
+    assert {str(route.robot) for route in table} == {"BRACO", *(f"R{number}" for number in range(17, 25))}
+    assert [str(route.robot) for route in gone] == [f"R{number}" for number in range(17)]
 
 
 def test_deciding_changes_nothing(router: Router) -> None:
