@@ -25,15 +25,19 @@ PEERS = (("127.0.0.1", 9001), ("127.0.0.1", 9002))
 
 
 class Resident:
-    """Answers nothing, counts everything; translates by saying that it did."""
+    """Counts everything; translates by saying that it did; answers `reply` at once where there is one."""
 
-    def __init__(self) -> None:
+    def __init__(self, exchange: Exchange) -> None:
+        self.reply: str | None = None
+        self._exchange = exchange
         self.answered: list[Frame] = []
         self.translated: list[Frame] = []
         self.undelivered_frames: list[tuple[Frame, Verdict]] = []
 
     def answer(self, frame: Frame, way: Way, now: float) -> None:
         self.answered.append(frame)
+        if self.reply and not frame.source.is_numbered:
+            self._exchange.send(psiu_ascii.message(BASE, frame.source, *self.reply.split()), now)
 
     def translate(self, frame: Frame, way: Way, now: float) -> Verdict:
         self.translated.append(frame)
@@ -87,7 +91,7 @@ class World:
         own = {BASE: "psiu-ascii", Address.numbered(0): "psiu-hexa"}
         router = Router(own, bindings, identity, heard=self._heard)
         self.exchange = Exchange(BASE, router)
-        self.resident = self.exchange.resident = Resident()
+        self.resident = self.exchange.resident = Resident(self.exchange)
         self.links: dict[str, QuietLink] = {}
         self._add("radio", MemoryAdapter())
         self._add("wifi", MemoryDatagrams(ends=PEERS))
@@ -367,6 +371,10 @@ class FramesAreConserved(RuleBasedStateMachine):
         before = self.world.exchange.accounts[SELF.link].arrived
         self.world.exchange.send(frame, self.world.now, patience)
         assert self.world.exchange.accounts[SELF.link].arrived == before + 1
+
+    @rule(reply=st.sampled_from(("quantoscomandos 3", None)))
+    def the_broker_answers_or_does_not(self, reply: str | None) -> None:
+        self.world.resident.reply = reply
 
     @rule(name=names, noise=st.binary(max_size=40), second=st.booleans())
     def noise_arrives(self, name: str, noise: bytes, second: bool) -> None:

@@ -107,7 +107,7 @@ class Router:
             hops = () if destination.is_numbered else self._everyone(protocol, arrived)
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
-            return _ANSWER
+            return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
         if target.way.link not in self._ports:
             return Decision("drop", verdict=LINK_DOWN)
         if target.protocol != protocol:

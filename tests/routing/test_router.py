@@ -95,6 +95,10 @@ def test_a_frame_for_the_broker_is_answered_here(router: Router) -> None:
     assert router.route(packet(ARM_NUMBER, BROKER_NUMBER), ARM, 0.0).action == "answer"
 
 
+def test_the_broker_does_not_talk_to_itself(router: Router) -> None:
+    assert router.route(text(BASE, BASE), SELF, 0.0).verdict == "same_way"
+
+
 @pytest.mark.parametrize("liar", [BASE, EVERYONE])
 def test_nobody_can_pass_for_the_broker_or_for_everyone(router: Router, liar: Address) -> None:
     assert router.route(text(liar, MNERIM), PHONE, 0.0).verdict == "refused"
