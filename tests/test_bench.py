@@ -1,0 +1,26 @@
+"""`make bench` in little: whether it works, not how fast."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.timeout(180)
+def test_the_bench_prints_all_figures_and_nothing_is_lost() -> None:
+    command = [sys.executable, "-m", "tests.bench", "--quick"]
+    bench = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert bench.returncode == 0, bench.stdout + bench.stderr
+    for line in (
+        "What a frame costs",
+        "UDP → UDP  bare forwarder",
+        "UDP → UDP  psiu-broker",
+        "pty → pty  psiu-broker",
+        "a client (told 100%)",
+        "10 robots known",
+        "Latency at 1 kHz",
+    ):
+        assert line in bench.stdout
