@@ -96,6 +96,10 @@ class Way(NamedTuple):
 
 def peer_text(peer: object) -> str | None:
     """A far end in words, as ``host:port`` over UDP; None where a link has only one."""
-    if peer is None:
-        return None
-    return ":".join(str(part) for part in peer) if isinstance(peer, tuple) else str(peer)
+    match peer:
+        case None:
+            return None
+        case (str(host), int(port), *_):
+            return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        case _:
+            return str(peer)

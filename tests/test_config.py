@@ -131,8 +131,10 @@ def test_a_robot_s_address_is_in_the_domain_of_its_link(read):
 
 
 def test_a_udp_robot_s_peer_is_what_the_adapter_calls_it(read):
-    robot = read(BROKER + WIFI + '[robots.MNERIM]\nlink = "wifi"\npeer = "127.0.0.1:9001"\n').robots["MNERIM"]
-    assert robot.peer == ("127.0.0.1", 9001)
+    for peer, address in (("127.0.0.1:9001", ("127.0.0.1", 9001)), ("[::1]:9001", ("::1", 9001, 0, 0))):
+        wifi = WIFI.replace("127.0.0.1:9000", peer.replace("9001", "9000"))
+        text = f'{BROKER}{wifi}peers = ["{peer}"]\n[robots.MNERIM]\nlink = "wifi"\npeer = "{peer}"\n'
+        assert read(text).robots["MNERIM"].peer == address
 
 
 def test_a_broker_without_links_is_allowed(read):
@@ -335,8 +337,13 @@ def test_a_robot_s_name_is_not_an_address(problems):
         ),
         pytest.param(
             WIFI + '[robots.A]\nlink="wifi"\npeer="127.0.0.1"',
-            'robots.A.peer: expected "HOST:PORT", got "127.0.0.1"',
+            'robots.A.peer: expected "ADDRESS:PORT", got "127.0.0.1"',
             id="a peer without a port",
+        ),
+        pytest.param(
+            WIFI + '[robots.A]\nlink="wifi"\npeer="127.0.0.1:9001"',
+            "robots.A.peer: 127.0.0.1:9001 is not among links.wifi.peers; add it there",
+            id="a peer that the link does not have",
         ),
         pytest.param(
             RADIO.replace("links.radio", 'links."my radio"'),

@@ -5,6 +5,7 @@ protocol's codec and to the link itself, and are split among those three here.
 import re
 import tomllib
 from collections.abc import Collection, Mapping
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -209,15 +210,23 @@ def _robot(
                 problems.add((*key, word), f"is for psiu-hexa, and link {link.name} speaks {link.protocol}; remove it")
     peer: Peer = robot.peer
     if robot.peer is not None and link.adapter.datagrams:
-        peer = _host_and_port(robot.peer)
+        peer = _socket_address(robot.peer)
+        known = getattr(link.adapter, "peers", ())
         if peer is None:
-            text = f'expected "HOST:PORT", got {got(robot.peer)}; write it like "192.168.1.20:9001"'
+            text = f'expected "ADDRESS:PORT", got {got(robot.peer)}; write it in numbers, like "192.168.1.20:9001"'
             problems.add((*key, "peer"), text)
+        elif robot.peer not in known:
+            problems.add((*key, "peer"), f"{robot.peer} is not among links.{link.name}.peers; add it there")
     return RobotConfiguration(name, robot.link, link.protocol, address, peer, robot.nodes, robot.sensor_reply)
 
 
-def _host_and_port(text: str) -> tuple[str, int] | None:
-    match = re.fullmatch(r"(?:\[(?P<v6>[0-9A-Fa-f:.%\w]+)\]|(?P<host>[^\s:\[\]]+)):(?P<port>[0-9]{1,5})", text)
-    if match is None or not 0 < int(match["port"]) <= 65535:
+def _socket_address(text: str) -> Peer:
+    """``192.168.1.20:9001`` or ``[fe80::1]:9001`` as a socket names it; None where it is neither."""
+    host, _, port = text.rpartition(":")
+    try:
+        address = ip_address(host.removeprefix("[").removesuffix("]") if host.startswith("[") else host)
+    except ValueError:
         return None
-    return match["v6"] or match["host"], int(match["port"])
+    if not port.isascii() or not port.isdigit() or not 0 < int(port) <= 65535:
+        return None
+    return (str(address), int(port)) if address.version == 4 else (str(address), int(port), 0, 0)
