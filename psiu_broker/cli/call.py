@@ -102,7 +102,7 @@ def discover(connection: Connection) -> None:
     if connection.as_json:
         print_json([card.model_dump(mode="json") for card in cards])
     else:
-        show_robots(cards)
+        show_robots(cards, drawn=on_terminal())
 
 
 def answer_line(robot: str, answer: Answer) -> str:

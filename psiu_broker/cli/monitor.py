@@ -56,7 +56,7 @@ def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
             click.echo(f"Listening to {printable(asked)}; Ctrl-C ends.", err=True)
         try:
             for at, kind, payload in client.monitor(asked):
-                message = _gone(client, at) if kind == "delete" else _read(payload)
+                message = _gone(client, at) if kind == "delete" else read_message(payload)
                 if wanted(message):
                     names.learn(message)
                     click.echo(_json(at, message) if connection.as_json else message_line(at, message, names.known))
@@ -90,7 +90,7 @@ def message_line(key: str, message: Message, names: Mapping[str, str]) -> str:
     return printable(f"{key}  {message.get('text') or to_json(message).decode()}")
 
 
-def _read(payload: bytes) -> Message:
+def read_message(payload: bytes) -> Message:
     """A payload as an object, whatever it is: anybody may put anything on the bus."""
     with suppress(ValueError):
         message = from_json(payload)

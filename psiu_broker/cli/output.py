@@ -14,6 +14,7 @@ from rich.text import Text
 
 Cell = str | int | float | bool | datetime | None
 
+_PAPER_COLUMNS: Final = 110
 _STYLES: Final = {
     "open": "green", "opening": "yellow", "waiting": "yellow", "closed": "red",
     "yes": "green", "no": "red",
@@ -51,10 +52,11 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Cell]], nothing:
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for index, column in enumerate(columns):
         numbers = any(type(row[index]) in (int, float) for row in rows)
-        table.add_column(column, justify="right" if numbers else "left", no_wrap=index < len(columns) - 1)
+        last = index == len(columns) - 1
+        table.add_column(column, justify="right" if numbers else "left", no_wrap=not last, overflow="fold")
     for row in rows:
         table.add_row(*(_text(cell) for cell in row))
-    Console(highlight=False).print(table)
+    Console(highlight=False, width=None if on_terminal() else _PAPER_COLUMNS).print(table)
 
 
 def plain(cell: Cell) -> str:
@@ -78,7 +80,7 @@ def ago(seconds: float) -> str:
     for unit, length_s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length_s:
             return f"{seconds / length_s:.0f} {unit} ago"
-    return f"{max(seconds, 0.0):.0f} s ago"
+    return f"{seconds:.0f} s ago" if seconds >= 1 else "now"
 
 
 def styled(text: str, **style: Any) -> str:

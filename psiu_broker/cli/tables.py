@@ -35,7 +35,7 @@ def robots(connection: Connection) -> None:
     if connection.as_json:
         print_json([card.model_dump(mode="json") for card in cards])
     else:
-        show_robots(cards)
+        show_robots(cards, drawn=on_terminal())
 
 
 @click.command(epilog=examples("psiu links", "psiu links --json | jq '.[] | select(.state != \"open\")'"))
@@ -50,7 +50,9 @@ def links(connection: Connection) -> None:
     if connection.as_json:
         _print_each(told)
     else:
-        show_links([(broker, Link.model_validate(link)) for broker, found in told for link in found])
+        show_links(
+            [(broker, Link.model_validate(link)) for broker, found in told for link in found], drawn=on_terminal()
+        )
 
 
 @click.command(epilog=examples("psiu routes", "psiu routes --json"))
@@ -82,7 +84,7 @@ def ledger(connection: Connection) -> None:
     if connection.as_json:
         print_json([{"broker": broker, **each} for broker, each in told])
     else:
-        show_ledger(found)
+        show_ledger(found, drawn=on_terminal())
     wrong = [broker for broker, each in found if not each.balances]
     if wrong:
         raise Failure(f"the books of {', '.join(wrong)} do not balance: please report it")
@@ -131,9 +133,9 @@ def why(connection: Connection, a: str, b: str) -> None:
             click.echo(f"  {printable(step)}")
 
 
-def show_robots(cards: Sequence[Card]) -> None:
-    if on_terminal():
-        heads = ("robot", "address", "protocol", "where", "state", "last heard", "commands")
+def show_robots(cards: Sequence[Card], *, drawn: bool) -> None:
+    if drawn:
+        heads = ("robot", "protocol", "where", "state", "last heard", "commands")
         rows = [(card.broker, _robot(card)) for card in cards]
         print_table(*_with_brokers(heads, rows), "No robot is known yet. Ask who is there: psiu discover")
         return
@@ -144,8 +146,8 @@ def show_robots(cards: Sequence[Card]) -> None:
     )  # fmt: skip
 
 
-def show_links(found: Links) -> None:
-    if on_terminal():
+def show_links(found: Links, *, drawn: bool) -> None:
+    if drawn:
         heads = ("link", "adapter", "protocol", "state", "robots", "in", "out", "malformed", "queued", "reopened")
         rows = [(broker, _link(link)) for broker, link in found]
         nothing = "The broker has no links: add [links.NAME] to its configuration."
@@ -170,9 +172,9 @@ def show_routes(found: Routes) -> None:
     print_rows((r.robot, r.link, r.peer, r.origin, r.age_s, r.expires_in_s, broker) for broker, r in found)
 
 
-def show_ledger(found: Ledgers) -> None:
+def show_ledger(found: Ledgers, *, drawn: bool) -> None:
     rows = [(broker, _account(account)) for broker, each in found for account in (*each.accounts, each.total)]
-    if not on_terminal():
+    if not drawn:
         print_rows((*row, broker) for broker, row in rows)
         return
     heads = ("link", "arrived", "delivered", "answered", "dropped", "waiting", "why dropped")
@@ -204,7 +206,7 @@ def show_status(found: Iterable[tuple[Status, Health]]) -> None:
     for each, health in found:
         failed = ", ".join(name for name, good in health.checks.items() if not good)
         click.echo(styled(printable(each.broker), bold=True) + f"  psiu-broker {printable(each.version)}")
-        click.echo(f"  up since {ago(each.uptime_s)}, {each.started.astimezone():%Y-%m-%d %H:%M:%S}")
+        click.echo(f"  started {ago(each.uptime_s)}, {each.started.astimezone():%Y-%m-%d %H:%M:%S}")
         click.echo(f"  {each.links_open} of {each.links} links open, {each.robots} robots known")
         click.echo(f"  programs connect to {printable(' '.join(each.listen))}")
         well = styled("healthy", fg="green") if health.healthy else styled(f"not healthy: {failed}", fg="red")
@@ -237,7 +239,8 @@ def _robot(card: Card) -> Sequence[Cell]:
     where = _where(card.link, card.peer)
     own = [command.name for command in card.commands if command.name not in _EVERYBODYS]
     heard = card.last_heard or "never"
-    return card.robot, card.address, card.protocol, where, card.link_state, heard, " ".join(own)
+    name = card.robot if card.address in (None, card.robot) else f"{card.robot} {card.address}"
+    return name, card.protocol, where, card.link_state, heard, " ".join(own)
 
 
 def _link(link: Link) -> Sequence[Cell]:
