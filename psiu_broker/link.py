@@ -124,13 +124,14 @@ class Link:
     def writable(self) -> None:
         now = self._clock()
         self.expire(now)
-        while self._transport is not None and (parcel := self.outbox.take()) is not None:
+        full: set[Peer] = set()
+        while self._transport is not None and (parcel := self.outbox.take(full)) is not None:
             if self._transport.write(parcel.wire, parcel.peer):
                 self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
                 self.outbox.put_back(parcel)
-                return
+                full.add(parcel.peer)
             else:
                 self._hub.settled(parcel.fate, LINK_DOWN, now)
         self._note_empty()
@@ -180,7 +181,7 @@ class Link:
                 return REFUSED
         if self._avr_limits:
             self._warn_of_avr(frame, wire)
-        if not self.outbox.size and transport.write(wire, peer):
+        if not (self.outbox.size and self.outbox.waits_for(peer)) and transport.write(wire, peer):
             self._sent(frame, wire, peer, now)
             return DELIVERED
         if self._transport is None:

@@ -13,18 +13,20 @@ from psiu_broker.errors import LinkAbsent, LinkError
 
 
 class MemoryTransport(Transport):
-    """Remembers what was written; refuses while `full`."""
+    """Remembers what was written; refuses while `full`, and `full_peers` always."""
 
     def __init__(self, peers: Collection[Peer] = (None,)) -> None:
         self.written: list[tuple[bytes, Peer]] = []
         self.full = False
+        self.full_peers: set[Peer] = set()
         self.closed = False
         self.ends = list(peers)
 
     def write(self, data: bytes, peer: Peer) -> bool:
-        if not self.full:
+        full = self.full or peer in self.full_peers
+        if not full:
             self.written.append((data, peer))
-        return not self.full
+        return not full
 
     @property
     def peers(self) -> Collection[Peer]:

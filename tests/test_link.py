@@ -151,6 +151,23 @@ async def test_a_full_wire_makes_frames_wait_and_they_leave_in_order_when_there_
     assert hub.fates == ["delivered", "delivered"]
 
 
+async def test_a_peer_that_takes_nothing_holds_up_no_other(hub: Hub) -> None:
+    transport = MemoryTransport(peers=("a", "b"))
+    link = connected(hub, transport, adapter=MemoryDatagrams())
+    transport.full_peers = {"a"}
+    assert link.offer(command(1), "a", ARRIVED, 0.0) is None
+    assert link.offer(command(2), "b", ARRIVED, 0.0) == "delivered"
+    transport.full = True
+    assert link.offer(command(3), "b", ARRIVED, 0.0) is None
+    assert link.offer(command(4), "a", ARRIVED, 0.0) is None
+    transport.full = False
+    link.writable()
+    assert [(wire.split()[3], peer) for wire, peer in transport.written] == [(b"2", "b"), (b"3", "b")]
+    transport.full_peers = set()
+    link.writable()
+    assert [wire.split()[3] for wire in transport.wires[2:]] == [b"1", b"4"]
+
+
 async def test_a_stop_overtakes_what_waits(hub: Hub) -> None:
     transport = MemoryTransport()
     link = connected(hub, transport)

@@ -1,7 +1,7 @@
 """What waits for one link: bounded, urgent first, and never late."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import chain
 from typing import Final, NamedTuple
 
@@ -88,12 +88,18 @@ class Outbox:
         self.size += 1
         return evicted
 
-    def take(self) -> Parcel | None:
-        """The next parcel to send."""
+    def waits_for(self, peer: object) -> bool:
+        """Whether anything waits for `peer`: then what comes later must wait behind it."""
+        return any(parcel.peer == peer for parcel in self)
+
+    def take(self, passing_over: Collection[object] = ()) -> Parcel | None:
+        """The next parcel to send, to a peer that is not among `passing_over`."""
         for lane in self._lanes:
-            if lane:
-                self.size -= 1
-                return lane.popleft()
+            for place, parcel in enumerate(lane):
+                if parcel.peer not in passing_over:
+                    del lane[place]
+                    self.size -= 1
+                    return parcel
         return None
 
     def put_back(self, parcel: Parcel) -> None:
