@@ -91,6 +91,7 @@ class Link:
         self._told: tuple[State, str | None] = (self.state, self.reason)
         self.frames_in = self.frames_out = self.malformed = self.opened = 0
         self.last_heard: float | None = None
+        self.last_sent = -inf
         self.outbox = Outbox(configuration.options.queue_frames)
         self._askers = Askers() if unaddressed else None
         self._make_codec = codec
@@ -255,6 +256,7 @@ class Link:
 
     def _sent(self, frame: Frame, wire: bytes, peer: Peer, now: float) -> None:
         self.frames_out += 1
+        self.last_sent = now
         if self._askers is not None:
             self._askers.note(frame.destination, frame.source, now)
         if self._hub.bus.raw_listened:
