@@ -140,8 +140,8 @@ async def test_a_wrong_payload_is_a_bad_request_and_moves_nothing(
     [refusal] = await ask(program, "psiu/@call/A/b", payload)
     assert refusal.error == "bad_request"
     assert len(refusal.message) < 300
-    program.put("psiu/@call/A/b", payload)
-    program.put("psiu/@call/A/after", b"")
+    program.put("psiu/@call/A/b", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+    program.put("psiu/@call/A/after", b"", congestion_control=zenoh.CongestionControl.BLOCK)
     await until(lambda: robots.sent)
     assert robots.called == []
     assert [command for _, command, _ in robots.sent] == ["after"]

@@ -209,8 +209,8 @@ async def test_more_keys_than_are_kept_declared_all_arrive(
     count = KEYS_MAX + 200
     for number in range(count):
         publisher.publish(COMMAND._replace(subject=f"s{number}"), RADIO, time.time())
-        if number % 100 == 0:
-            await asyncio.sleep(0.01)  # DROP: give the wire its turn
+        if number % 50 == 49:  # no more at once than the queue to a program holds: it drops
+            await until(lambda: len(heard) == publisher.puts)
     await until(lambda: len(heard) == count)
     assert len(set(heard)) == count
 
@@ -275,14 +275,17 @@ sys.stdin.read()
             await asyncio.to_thread(stopped.stdout.readline)
             await until(lambda: publisher.listened)
             os.kill(stopped.pid, signal.SIGSTOP)
-            worst_s, end = 0.0, time.monotonic() + 1  # its lease ends after two seconds
-            while time.monotonic() < end:
+            flood = session.zenoh.declare_publisher("psiu/x/y/z", congestion_control=zenoh.CongestionControl.DROP)
+            for _ in range(20_000):  # its queue and its socket are full now
+                flood.put(b"x" * 1000)
+            worst_s = 0.0
+            for number in range(300):
                 begun = time.monotonic()
-                publisher.publish(COMMAND._replace(subject=f"s{publisher.puts % 2000}"), RADIO, begun)
+                publisher.publish(COMMAND._replace(subject=f"s{number}"), RADIO, begun)
                 worst_s = max(worst_s, time.monotonic() - begun)
             assert publisher.failures == 0
-            assert publisher.puts > 2000
-            assert worst_s < 0.5
+            assert publisher.puts == 300
+            assert worst_s < 4  # one that waited for room would take five; a busy machine takes its share
         finally:
             stopped.kill()
 

@@ -149,6 +149,7 @@ async def test_all_cards_come_each_on_its_own_key(queries: Queries, program: zen
 
 async def test_one_card_comes_alone_and_a_stranger_has_none(queries: Queries, program: zenoh.Session) -> None:
     assert set(await ask(program, "psiu/MNERIM")) == {"psiu/MNERIM"}
+    assert set(await ask(program, "psiu/0x12")) == {"psiu/0x12"}
     assert await ask(program, "psiu/STRANGER") == {}
 
 
