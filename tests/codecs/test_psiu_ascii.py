@@ -232,7 +232,7 @@ def test_binary_junk_is_one_malformed_with_the_text_in_it() -> None:
 
 @pytest.mark.parametrize("byte", [0x00, 0x09, 0x1F, 0x7F, 0x80, 0xE1, 0xFF])
 def test_a_frame_with_a_byte_that_is_not_printable_is_refused(byte: int) -> None:
-    wire = summed(b"PC 028 texto a%cb MNERIM " % byte)
+    wire = summed(b"PC 029 texto a%cb MNERIM " % byte)
     codec = ascii_codec()
     read(codec, ascii_codec().encode(message(MNERIM, PC, "texto", "axb")))
     assert frames(read(codec, wire)) == []

@@ -93,7 +93,7 @@ def test_loose_frames_without_end_and_without_anything_between_are_all_heard(cla
     data = claiming(claim) * 800
     pieces = [data[at : at + step] for at in range(0, len(data), step)]
     events = read(ascii_codec(), *pieces)
-    assert [event.wire for event in events] == [claiming(claim)] * 800
+    assert [event.wire for event in events if isinstance(event, Frame)] == [claiming(claim)] * 800
 
 
 @given(data=stream, warm=good)
