@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from typing import Final
 
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import EVERYONE, Address, peer_text
@@ -112,14 +113,9 @@ class Report:
         if destination != EVERYONE:
             steps.append(self._where(destination, target))
         steps.append(self._outcome(decision, destination, protocol, target))
-        delivered = decision.action in ("forward", "flood", "answer", "translate")
-        return Why(
-            a=str(source),
-            b=str(destination),
-            delivered=delivered,
-            verdict=decision.verdict or decision.action,
-            steps=steps,
-        )
+        verdict = decision.verdict or _ENDS[decision.action]
+        delivered = verdict in verdicts.KEPT
+        return Why(a=str(source), b=str(destination), delivered=delivered, verdict=verdict, steps=steps)
 
     def _where(self, address: Address, route: table.Route | None) -> str:
         now = self._clock()
@@ -152,6 +148,15 @@ class Report:
             case _:
                 return f"dropped ({decision.verdict}): {_REASONS.get(str(decision.verdict), '')}"
 
+
+_ENDS: Final[Mapping[str, verdicts.Verdict]] = {
+    "forward": verdicts.DELIVERED,
+    "flood": verdicts.DELIVERED,
+    "answer": verdicts.ANSWERED,
+    "translate": verdicts.ANSWERED,
+    "ask": verdicts.NO_ROUTE,
+}
+"""How a frame ends, as far as can be told beforehand."""
 
 _REASONS = {
     "no_route": "nobody knows it, and there is no open link to ask on",
