@@ -106,6 +106,10 @@ class HexaProfile(Profile):
         fields = psiu_hexa.fields(payload) if request.subject == "complex" else None
         return None if fields is None else Reply(None, tuple(field.hex() for field in fields))
 
+    def answers_to(self, request: Request) -> str:
+        """All alike: ACK and NAK name no request, and a sensor's answer no sensor."""
+        return ""
+
     def _signal(self, request: Request, payload: bytes) -> Reply | None:
         if not request.subject.startswith("node/"):
             return None

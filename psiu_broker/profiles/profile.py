@@ -66,3 +66,10 @@ class Profile(ABC):
     @abstractmethod
     def read(self, request: Request, frame: Frame) -> Reading | None:
         """What `frame`, sent to us by the robot, says about `request`; None where it is about something else."""
+
+    @abstractmethod
+    def answers_to(self, request: Request) -> str:
+        """What tells the answers to `request` from others: requests for which it is the same are mistaken for another.
+
+        PSIU numbers no message, so that a late answer to one such request reads as the answer to the next.
+        """

@@ -168,6 +168,9 @@ class PsiuProfile(Profile):
             return None
         return Reply(None, words.values)
 
+    def answers_to(self, request: Request) -> str:
+        return canonical(request.subject)
+
 
 def _check(command: Command, values: Sequence[Value]) -> None:
     """Raises: CallError refused, naming what `command` takes. exibecomando tells counts, not their order."""

@@ -1,10 +1,11 @@
 """The broker as a robot: what it answers to frames addressed to itself, and for robots that cannot list commands.
 
 Two brokers, or a broker and a robot that takes any frame for a command, must never keep each other talking: an
-answer is never answered, and what may be one that came too late is refused at most once in a while.
+answer is never answered, and what may be one that came too late is answered at most once in a while, longer than
+a frame may be on its way there and back.
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
@@ -12,11 +13,14 @@ from psiu_broker.frame import EVERYONE, Address, Frame
 from psiu_broker.messages import Answer, Command
 from psiu_broker.profiles.hexa import AVAILABLE, FREE, WTF
 from psiu_broker.profiles.psiu import COUNT, NAME, QUESTIONS, SHOW, Said, canonical, said, text
+from psiu_broker.profiles.rarely import Rarely
 
-PING_EVERY_S: Final = 0.1
+PING_EVERY_S: Final = 2.0
+"""A ping within this of our answer to one may be the answer to that (PSIU HEXA row 6 allows one a 100 ms)."""
+NAME_EVERY_S: Final = 30.0
+"""A name within this of ours may be the answer to it; who asks everyone is always told."""
 REFUSE_EVERY_S: Final = 2.0
 """As long as a robot has to answer: its late value must not be met with a falha that it answers in turn."""
-_REMEMBERED: Final = 256
 
 
 class Responder:
@@ -25,7 +29,7 @@ class Responder:
     def __init__(self, name: str, commands: Sequence[Command] = QUESTIONS) -> None:
         self.name = name
         self._commands = commands
-        self._last: dict[Hashable, float] = {}
+        self._rarely = Rarely()
 
     def answer(self, frame: Frame, now: float, pinging: bool = False) -> Frame | None:
         """The answer to a frame for the broker (or for everyone), if it deserves one.
@@ -39,25 +43,36 @@ class Responder:
             return self._packet(frame, now, pinging)
         return None
 
+    def listed(self, frame: Frame, name: str, commands: Sequence[Command], now: float) -> Frame | None:
+        """`listing` for `name`, a robot that the broker speaks for; its name is told once in a while."""
+        if canonical(said(frame).command) == NAME and not self._rarely.may((frame.source, name), now, NAME_EVERY_S):
+            return None
+        return listing(frame, name, commands)
+
+    def refused(self, frame: Frame, name: str, now: float) -> Frame | None:
+        """`refusal`, but to one sender of one command to `name` only once in a while."""
+        key = (frame.source, name, said(frame).command)
+        return refusal(frame, name) if self._rarely.may(key, now, REFUSE_EVERY_S) else None
+
     def _words(self, frame: Frame, now: float) -> Frame | None:
         words = said(frame)
         if not words.command:
             return None
         if canonical(words.command) == NAME:
             # Question and answer look alike, and a robot may take our answer for a question.
-            asked = frame.destination == EVERYONE or self._rarely((frame.source, NAME), now)
+            asked = frame.destination == EVERYONE or self._rarely.may((frame.source, self.name), now, NAME_EVERY_S)
             return _say(self.name, frame, NAME) if asked else None
         if words.answer:
             return None
         told = _listing(words, frame, self.name, self._commands)
-        if told is None and frame.destination != EVERYONE and self._rarely((frame.source, words.command), now):
-            told = refusal(frame, self.name)
+        if told is None and frame.destination != EVERYONE:
+            told = self.refused(frame, self.name, now)
         return told
 
     def _packet(self, frame: Frame, now: float, pinging: bool) -> Frame | None:
         payload = frame.payload
         if len(payload) == 0:
-            if pinging or not self._rarely(frame.source, now, PING_EVERY_S):
+            if pinging or not self._rarely.may(frame.source, now, PING_EVERY_S):
                 return None
             return psiu_hexa.packet(frame.destination, frame.source, b"")
         if len(payload) == 1:
@@ -66,27 +81,28 @@ class Responder:
             return psiu_hexa.packet(frame.destination, frame.source, bytes((FREE,)))
         return psiu_hexa.packet(frame.destination, frame.source, bytes((WTF,)))
 
-    def _rarely(self, key: Hashable, now: float, every_s: float = REFUSE_EVERY_S) -> bool:
-        """True at most once every `every_s` for one key."""
-        last = self._last.get(key)
-        if last is not None and now - last < every_s:
-            return False
-        self._last.pop(key, None)
-        if len(self._last) >= _REMEMBERED:
-            del self._last[next(iter(self._last))]
-        self._last[key] = now
-        return True
-
 
 def listing(frame: Frame, name: str, commands: Sequence[Command]) -> Frame | None:
-    """The answer of `name` to an ASCII quantoscomandos or exibecomando; None for any other frame."""
-    return _listing(said(frame), frame, name, commands)
+    """The answer of `name` to an ASCII qualseunome, quantoscomandos or exibecomando; None for any other frame.
+
+    A qualseunome to a name is taken for a question: robots of bytes ask none that this could answer.
+    """
+    words = said(frame)
+    if canonical(words.command) == NAME and words.status is None:
+        return _say(name, frame, NAME)
+    return _listing(words, frame, name, commands)
 
 
 def outcome(frame: Frame, name: str, answer: Answer) -> Frame:
-    """The answer of `name` to the ASCII command `frame`, from what a robot of another protocol answered to the call."""
+    """The answer of `name` to the ASCII command `frame`, from what a robot of another protocol answered to the call.
+
+    A field of no bytes is ``0x``; an answer that has no words is a refusal.
+    """
     status = [] if answer.status is None else [answer.status]
-    values = [text(value) for value in answer.values]
+    try:
+        values = ["0x" if value == "" else text(value) for value in answer.values]
+    except ValueError:
+        return refusal(frame, name)
     return _say(name, frame, said(frame).command, *status, *values)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
@@ -55,7 +55,9 @@ def test_the_broker_tells_its_name_to_who_asks_it_but_not_to_a_robot_that_asks_b
     responder = Responder("base")
     assert responder.answer(ask("qualseunome"), 0.0) is not None
     assert responder.answer(ask("qualseunome"), 0.1) is None
-    assert responder.answer(ask("qualseunome"), 2.1) is not None
+    assert responder.answer(ask("qualseunome"), 20.0) is None
+    assert responder.answer(ask("qualseunome", EVERYONE), 20.0) is not None
+    assert responder.answer(ask("qualseunome"), 30.1) is not None
 
 
 def test_a_command_to_everyone_is_not_refused() -> None:
@@ -86,7 +88,7 @@ def test_a_late_value_of_a_robot_that_takes_falha_for_a_command_ends_the_talk() 
     assert responder.answer(frame, 2.1) is not None
 
 
-def test_a_ping_is_answered_at_most_once_in_100_ms_for_each_robot() -> None:
+def test_a_ping_soon_after_our_answer_to_one_may_be_the_answer_to_that() -> None:
     responder = Responder("base")
     ping = psiu_hexa.packet(ARM, OURS, b"")
     answer = responder.answer(ping, 0.0)
@@ -94,7 +96,8 @@ def test_a_ping_is_answered_at_most_once_in_100_ms_for_each_robot() -> None:
     assert (answer.source, answer.destination, answer.payload) == (OURS, ARM, b"")
     assert responder.answer(ping, 0.05) is None
     assert responder.answer(psiu_hexa.packet(Address.numbered(0x13), OURS, b""), 0.05) is not None
-    assert responder.answer(ping, 0.11) is not None
+    assert responder.answer(ping, 1.9) is None
+    assert responder.answer(ping, 2.1) is not None
 
 
 def test_a_ping_that_answers_ours_is_not_answered() -> None:
@@ -135,33 +138,43 @@ def packets() -> Iterator[bytes]:
     yield bytes((1, 1, 1))
 
 
-@pytest.mark.parametrize("first", [*packets()])
-def test_two_brokers_fall_silent_after_a_packet(first: bytes) -> None:
-    one, other = Responder("one"), Responder("other")
-    frame: Frame | None = psiu_hexa.packet(ARM, OURS, first)
-    for step in range(6):
+def exchange(first: Frame, gaps_s: list[float]) -> int:
+    """How many frames two brokers exchange from `first` on, each one under way for the next of `gaps_s`."""
+    brokers = Responder("base"), Responder("PC")
+    frame: Frame | None = first
+    now = 0.0
+    for step, gap_s in enumerate(gaps_s):
+        now += gap_s
+        frame = brokers[step % 2].answer(frame, now)
         if frame is None:
-            return
-        frame = (one, other)[step % 2].answer(frame, step * 0.02)
-    pytest.fail("they still talk")
+            return step
+    return len(gaps_s)
 
 
-@given(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60), st.booleans())
-def test_two_brokers_fall_silent_after_any_words_and_never_raise(message: str, everyone: bool) -> None:
-    one, other = Responder("base"), Responder("PC")
-    frame: Frame | None = Frame(PC, EVERYONE if everyone else BASE, "", message.encode(), "psiu-ascii")
-    for step in range(4):
-        if frame is None:
-            return
-        frame = (one, other)[step % 2].answer(frame, step * 10.0)
-    pytest.fail("they still talk")
+@given(st.sampled_from([*packets()]), st.lists(st.floats(0, 0.99), min_size=8, max_size=8))
+@example(b"", [0.06] * 8)
+def test_two_brokers_fall_silent_after_a_packet(first: bytes, gaps_s: list[float]) -> None:
+    assert exchange(psiu_hexa.packet(ARM, OURS, first), gaps_s) <= 3
+
+
+words = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60)
+questions = st.sampled_from(["qualseunome", "QUALSEUNOME", "quantoscomandos", "exibecomando 1", "parafrente 1"])
+
+
+@given(words | questions, st.booleans(), st.lists(st.floats(0, 14), min_size=8, max_size=8))
+@example("qualseunome", False, [2.5] * 8)
+@example("qualseunome", True, [10.0] * 8)
+def test_two_brokers_fall_silent_after_any_words_and_never_raise(
+    message: str, everyone: bool, gaps_s: list[float]
+) -> None:
+    assert exchange(Frame(PC, EVERYONE if everyone else BASE, "", message.encode(), "psiu-ascii"), gaps_s) <= 3
 
 
 def test_the_responder_remembers_a_bounded_number_of_robots() -> None:
     responder = Responder("base")
     for number in range(5000):
         responder.answer(ask("x", source=Address.named(f"R{number}")), 0.0)
-    assert len(responder._last) <= 256
+    assert len(responder._rarely) <= 256
 
 
 def test_a_hexa_robots_nodes_are_listed_for_an_ascii_asker() -> None:
@@ -176,7 +189,8 @@ def test_a_hexa_robots_nodes_are_listed_for_an_ascii_asker() -> None:
     assert told("exibecomando 5") == "BRACO exibecomando falha"
     assert told("garra 45") is None
     assert told("quantoscomandos 4") is None
-    assert told("qualseunome") is None
+    assert told("qualseunome") == "BRACO qualseunome"
+    assert told("qualseunome sucesso") is None
 
 
 def test_a_call_made_for_an_ascii_robot_is_answered_in_its_words() -> None:
@@ -185,6 +199,38 @@ def test_a_call_made_for_an_ascii_robot_is_answered_in_its_words() -> None:
     assert outcome(frame, "BRACO", Answer(values=[42, 1.5], elapsed_ms=1)).payload == b"garra 42 1.5"
     told = refusal(frame, "BRACO")
     assert (told.source, told.destination, told.payload) == (Address.named("BRACO"), PC, b"garra falha")
+
+
+def test_an_answer_with_an_empty_field_or_without_words_is_still_an_answer() -> None:
+    frame = ask("complex 0xa1b2", Address.named("BRACO"))
+    assert outcome(frame, "BRACO", Answer(values=["", "07"], elapsed_ms=1)).payload == b"complex 0x 07"
+    assert outcome(frame, "BRACO", Answer(values=["a b"], elapsed_ms=1)).payload == b"complex falha"
+    assert outcome(frame, "BRACO", Answer(values=[float("inf")], elapsed_ms=1)).payload == b"complex falha"
+
+
+def test_a_robot_spoken_for_tells_its_name_to_one_asker_once_in_a_while_and_what_it_can_do_at_any_time() -> None:
+    responder = Responder("base")
+    braco, commands = Address.named("BRACO"), HexaProfile({}).commands()
+
+    def told(message: str, now: float, name: str = "BRACO") -> bool:
+        return responder.listed(ask(message, braco), name, commands, now) is not None
+
+    assert [told("qualseunome", now) for now in (0.0, 5.0, 29.0, 31.0)] == [True, False, False, True]
+    assert told("qualseunome", 31.0, "OUTRO")
+    assert told("quantoscomandos", 0.0)
+    assert told("quantoscomandos", 0.1)
+
+
+def test_a_refusal_for_a_robot_spoken_for_is_said_once_in_two_seconds_to_each_for_each_command() -> None:
+    responder = Responder("base")
+
+    def refused(message: str, now: float, name: str = "BRACO", source: Address = PC) -> bool:
+        return responder.refused(ask(message, Address.named(name), source), name, now) is not None
+
+    assert [refused("garra 500", now) for now in (0.0, 1.9, 2.1)] == [True, False, True]
+    assert refused("luz", 2.1)
+    assert refused("garra 500", 2.1, "OUTRO")
+    assert refused("garra 500", 2.1, source=BASE)
 
 
 def test_a_broker_with_more_commands_lists_them() -> None:
