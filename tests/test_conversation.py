@@ -1,113 +1,17 @@
 """Calls to robots: tries, turns and deadlines, on a clock that jumps instead of waiting."""
 
 import asyncio
-import functools
-import selectors
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import pytest
+from scripted_robots import ARM, BASE, MNERIM, OURS, Robots, jumping, now, refused
 
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
-from psiu_broker.conversation import WAITING_KEPT, Conversations
+from psiu_broker.conversation import Robot
+from psiu_broker.conversation.turns import WAITING_KEPT
 from psiu_broker.errors import CallError, EncodeError
 from psiu_broker.frame import Address, Frame
-from psiu_broker.messages import Answer, Value
-from psiu_broker.profiles import HexaProfile, Node, PsiuProfile, Request
-
-BASE = Address.named("base")
-MNERIM = Address.named("MNERIM")
-OURS = Address.numbered(1)
-ARM = Address.numbered(0x12)
-
-
-class JumpingSelector(selectors.DefaultSelector):
-    """Where the loop would sleep, its clock jumps."""
-
-    jumped_s = 0.0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        assert timeout is not None, "nothing is left that could wake the loop"
-        self.jumped_s += max(timeout, 0.0)
-        return super().select(0)
-
-
-class JumpingLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time is what its timers make of it."""
-
-    def __init__(self) -> None:
-        self._jumping = JumpingSelector()
-        super().__init__(self._jumping)
-
-    def time(self) -> float:
-        return 1000.0 + self._jumping.jumped_s
-
-
-def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run an async test on a jumping clock."""
-
-    @functools.wraps(test)
-    def run(*args: Any, **kwargs: Any) -> None:
-        with asyncio.Runner(loop_factory=JumpingLoop) as runner:
-            runner.run(test(*args, **kwargs))
-
-    return run
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
-class Robots:
-    """A broker's worth of calls to scripted robots: `script` says what each frame sent is answered with."""
-
-    def __init__(self, **options: Any) -> None:
-        self.conversations = Conversations(self._send, **options)
-        self.sent: list[tuple[float, bytes]] = []
-        self.ages: list[float] = []
-        self.refuse: CallError | None = None
-        self.script: Callable[[Frame], Sequence[tuple[float, bytes]]] = lambda _: ()
-        self.begun = now()
-
-    def _send(self, frame: Frame, age_s: float) -> CallError | None:
-        if self.refuse is not None:
-            return self.refuse
-        self.sent.append((round(now() - self.begun, 6), frame.payload))
-        self.ages.append(round(age_s, 6))
-        for delay_s, payload in self.script(frame):
-            answer = frame._replace(source=frame.destination, destination=frame.source, subject="", payload=payload)
-            asyncio.get_running_loop().call_later(delay_s, self.say, answer)
-        return None
-
-    def say(self, frame: Frame) -> bool:
-        return self.conversations.heard(frame, now())
-
-    async def ascii(self, command: str, *parameters: Value, address: Address = MNERIM, **more: Any) -> Answer:
-        def build(request: Request) -> Frame:
-            return psiu_ascii.message(BASE, address, *request.payload.decode().split())
-
-        return await self.conversations.call(
-            robot=str(address), own=BASE, address=address, profile=PsiuProfile(), build=build,
-            command=command, parameters=parameters, **{"link": "radio", **more},
-        )  # fmt: skip
-
-    async def hexa(self, command: str, *parameters: Value, **more: Any) -> Answer:
-        nodes = {"garra": Node(node=4, type="servo"), "sonar": Node(node=7, type="distance", unit="cm")}
-        return await self.conversations.call(
-            robot="BRACO", own=OURS, address=ARM, profile=HexaProfile(nodes),
-            build=lambda request: psiu_hexa.packet(OURS, ARM, request.payload),
-            command=command, parameters=parameters, **{"link": "arm", **more},
-        )  # fmt: skip
-
-    @property
-    def idle(self) -> bool:
-        return not self.conversations._lanes and not self.conversations._under_way
-
-
-async def refused(call: Awaitable[Answer]) -> CallError:
-    with pytest.raises(CallError) as caught:
-        await call
-    return caught.value
+from psiu_broker.profiles import PsiuProfile, Request
 
 
 @jumping
@@ -184,7 +88,7 @@ async def test_the_callers_deadline_is_kept_and_a_longer_one_waits_longer() -> N
     error = await refused(robots.ascii("quantoscomandos", timeout_s=0.5))
     assert (error.code, str(error)) == ("no_answer", "no answer from MNERIM after 1 try")
     assert now() - robots.begun == pytest.approx(1.0)
-    robots.script = lambda _: [(29, b"parafrente sucesso")]
+    robots.script = lambda _: [(25, b"parafrente sucesso")]
     assert (await robots.ascii("parafrente", 100, timeout_s=30)).status == "sucesso"
 
 
@@ -221,38 +125,39 @@ async def test_a_frame_that_the_protocol_cannot_say_is_refused() -> None:
     def build(request: Request) -> Frame:
         raise EncodeError("the frame would be 1003 bytes")
 
-    call = robots.conversations.call(
-        robot="MNERIM", own=BASE, address=MNERIM, profile=PsiuProfile(), build=build,
-        command="x", parameters=[], link="radio",
-    )  # fmt: skip
-    error = await refused(call)
+    robot = Robot("MNERIM", BASE, MNERIM, PsiuProfile(), build, "radio")
+    error = await refused(robots.conversations.call(robot, "x", []))
     assert (error.code, str(error)) == ("refused", "x cannot be sent to MNERIM: the frame would be 1003 bytes")
     assert robots.idle
 
 
 @jumping
-async def test_a_frame_dropped_from_its_outbox_ends_the_call() -> None:
+async def test_a_frame_dropped_from_its_outbox_ends_the_call_and_leaves_no_debt() -> None:
     robots = Robots()
+    robots.stuck = True
+    begun = now()
     task = asyncio.ensure_future(robots.ascii("parafrente", 100))
     await asyncio.sleep(0.1)
+    dropped = robots._kept[0][1]
     expired = CallError("expired", "it waited too long")
-    robots.conversations.undelivered(psiu_ascii.message(BASE, MNERIM, "parafrente", "50"), expired)
+    robots.conversations.undelivered(psiu_ascii.message(BASE, MNERIM, "parafrente", "100"), expired)
     await asyncio.sleep(0.1)
     assert not task.done()
-    robots.conversations.undelivered(psiu_ascii.message(BASE, MNERIM, "parafrente", "100"), expired)
+    robots.conversations.undelivered(dropped, expired)
     assert await refused(task) is expired
+    robots.stuck = False
+    robots.script = lambda _: [(0.1, b"parafrente sucesso")]
+    await robots.ascii("parafrente", 100)
+    assert now() - begun == pytest.approx(0.3)
 
 
 @jumping
-async def test_a_complaint_has_motion_sent_again_once_the_robot_is_quiet() -> None:
+async def test_a_frame_that_never_left_its_outbox_is_not_an_unknown_outcome() -> None:
     robots = Robots()
-    robots.script = lambda _: [(0.3, b"parafrente sucesso")] if len(robots.sent) == 2 else ()
-    task = asyncio.ensure_future(robots.ascii("parafrente", 100))
-    for _ in range(3):
-        await asyncio.sleep(0.01)
-        robots.conversations.complained("radio")
-    assert (await task).status == "sucesso"
-    assert [at for at, _ in robots.sent] == pytest.approx([0, 0.06])
+    robots.stuck = True
+    error = await refused(robots.ascii("parafrente", 100, timeout_s=0.55))
+    assert (error.code, str(error)) == ("expired", "nothing was sent")
+    assert now() - robots.begun == pytest.approx(0.55)
 
 
 @jumping
@@ -270,35 +175,6 @@ async def test_silence_after_a_complaint_is_still_an_unknown_outcome() -> None:
     robots.script = lambda _: [(0.1, b"N")] if len(robots.sent) == 1 else ()
     assert (await refused(robots.hexa("garra", 45))).code == "outcome_unknown"
     assert len(robots.sent) == 2
-
-
-@jumping
-async def test_a_complaint_elsewhere_repeats_nothing() -> None:
-    robots = Robots()
-    task = asyncio.ensure_future(robots.ascii("parafrente", 100, link="wifi", peer=("127.0.0.1", 9001)))
-    await asyncio.sleep(0.01)
-    robots.conversations.complained("radio")
-    robots.conversations.complained("wifi", ("127.0.0.1", 9002))
-    assert (await refused(task)).code == "outcome_unknown"
-    assert len(robots.sent) == 1
-
-
-@jumping
-async def test_a_complaint_that_may_be_of_either_robot_moves_neither_twice() -> None:
-    robots = Robots()
-    other = Address.named("OUTRO")
-    third = Address.named("TERCEIRO")
-    tasks = [
-        asyncio.ensure_future(robots.ascii("parafrente", 100)),
-        asyncio.ensure_future(robots.ascii("parafrente", 50, address=other)),
-        asyncio.ensure_future(robots.ascii("quantoscomandos", address=third, timeout_s=1)),
-    ]
-    await asyncio.sleep(0.01)
-    robots.conversations.complained("radio")
-    await asyncio.gather(*tasks, return_exceptions=True)
-    payloads = [payload for _, payload in robots.sent]
-    assert payloads.count(b"parafrente 100") == payloads.count(b"parafrente 50") == 1
-    assert payloads.count(b"quantoscomandos") == 2
 
 
 @jumping
@@ -536,28 +412,29 @@ async def test_a_talkative_robot_cannot_push_out_its_own_answer_or_fill_memory()
     robots.say(psiu_hexa.packet(ARM, OURS, b"A"))
     for _ in range(1000):
         robots.say(psiu_hexa.packet(ARM, OURS, b"B"))
-    assert len(robots.conversations._under_way[ARM].heard) < 10
+    assert len(robots.conversations._under_way[ARM][0].heard) < 10
     assert (await task).status == "sucesso"
 
 
 @jumping
-async def test_a_ping_of_ours_is_known_while_it_waits_and_while_late_answers_may_come() -> None:
+async def test_a_ping_of_ours_is_known_while_it_waits_and_its_late_answers_are_no_questions() -> None:
     robots = Robots()
     assert not robots.conversations.pinging(ARM)
     task = asyncio.ensure_future(robots.hexa("ping"))
     await asyncio.sleep(0.1)
     assert robots.conversations.pinging(ARM)
     assert (await refused(task)).code == "no_answer"
-    assert robots.conversations.pinging(ARM)
-    await asyncio.sleep(2.1)
     assert not robots.conversations.pinging(ARM)
+    assert not robots.says(b"")
+    task = asyncio.ensure_future(robots.hexa("ping", timeout_s=0.3))
+    assert (await refused(task)).code == "no_answer"
+    assert robots.says(b"")
+    assert not robots.says(b"")
     robots.script = lambda _: [(0.1, b"")]
     assert (await robots.hexa("ping")).status == "sucesso"
-    assert not robots.conversations.pinging(ARM)
-    assert not robots.conversations._late_pings
+    assert not robots.says(b"")
 
 
 @jumping
 async def test_hearing_costs_one_look_when_no_call_is_under_way() -> None:
-    conversations = Conversations(lambda frame, age_s: None)
-    assert not conversations.heard(None, 0.0)  # type: ignore[arg-type]
+    assert not Robots().conversations.heard(None, 0.0)  # type: ignore[arg-type]

@@ -1,0 +1,292 @@
+"""Calls to robots for whoever makes them: where the robot is, what it understands, and the broker's own commands."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any, Final
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.config import Configuration
+from psiu_broker.conversation import Conversations, Robot, Traffic
+from psiu_broker.errors import CallCode, CallError
+from psiu_broker.exchange import Exchange
+from psiu_broker.frame import EVERYONE, Address, Frame
+from psiu_broker.messages import Answer, CallRequest, Command
+from psiu_broker.profiles import HexaProfile, Profile, PsiuProfile
+from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, listed
+from psiu_broker.routing.router import SELF
+from psiu_broker.routing.table import Route
+from psiu_broker.routing.verdicts import DELIVERED, Verdict
+
+log = logging.getLogger(__name__)
+
+DISCOVER: Final = "discover"
+"""The broker's own command: ask on every link who is there and what they can do."""
+OWN_COMMANDS: Final = (*QUESTIONS, Command(name=DISCOVER))
+
+SOUGHT_S: Final = 1.0
+"""How long a call waits for an unknown robot to answer to its name."""
+LISTENING_S: Final = 0.6
+"""How long a discovery waits for robots to say their names."""
+COMMANDS_ASKED: Final = 64
+_MOMENT_S: Final = 0.001
+"""An outbox reads its clock a moment after a call does."""
+
+_DROPPED: Final[dict[Verdict, tuple[CallCode, str]]] = {
+    "no_route": ("unknown_robot", "nobody knows it"),
+    "link_down": ("link_down", "its link is down"),
+    "queue_full": ("busy", "the outbox of its link is full"),
+    "expired": ("expired", "its link was busy for too long; nothing was sent"),
+    "refused": ("refused", "its link cannot carry this"),
+    "duplicate": ("refused", "the same frame was just heard from another sender"),
+    "same_way": ("unknown_robot", "it is the broker itself"),
+}
+
+
+@dataclass(slots=True)
+class _Search:
+    """The callers that wait for a robot to be heard."""
+
+    found: asyncio.Event = field(default_factory=asyncio.Event)
+    callers: int = 0
+
+
+class Calling:
+    """Knows how to reach each robot; implements `conversation.Links`."""
+
+    def __init__(
+        self, configuration: Configuration, exchange: Exchange, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.name = Address.named(configuration.broker.name)
+        self.conversations = Conversations(self)
+        self._robots = {Address.named(robot.name): robot for robot in configuration.robots.values()}
+        self._exchange = exchange
+        self._router = exchange.router
+        self._clock = clock
+        self._profiles: dict[Address, Profile] = {}
+        self._searches: dict[Address, _Search] = {}
+
+    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
+        """Tell `robot` a command and return its answer, within `request.timeout_s` if it is given.
+
+        Raises:
+            CallError: there is no answer; its code says why.
+        """
+        begun = asyncio.get_running_loop().time()
+        if robot == self.name or ((route := self._router.find(robot)) is not None and route.way == SELF):
+            return await self._told(command, request)
+        if route is None:
+            route = await self._seek(robot, request.timeout_s)
+        timeout_s = request.timeout_s
+        if timeout_s is not None:
+            timeout_s -= asyncio.get_running_loop().time() - begun
+        return await self.ask(route, command, request.parameters, timeout_s)
+
+    async def tell(self, robot: Address, command: str, request: CallRequest) -> None:
+        """Send a command and go on: what the robot answers is nobody's.
+
+        Raises:
+            CallError: it cannot be sent; its code says why.
+        """
+        begun = asyncio.get_running_loop().time()
+        route = self._router.find(robot) or await self._seek(robot, request.timeout_s)
+        if route.way == SELF:
+            await self._told(command, request)
+            return
+        fresh_s = self._exchange.links[route.way.link].configuration.options.max_age_s
+        if request.timeout_s is not None:
+            fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
+        await self.conversations.tell(self._robot(route), command, request.parameters, fresh_s=fresh_s)
+
+    async def ask(
+        self,
+        route: Route,
+        command: str,
+        parameters: Sequence[Any] = (),
+        timeout_s: float | None = None,
+        fresh_s: float = inf,
+    ) -> Answer:
+        """Tell the robot of `route` a command, as `Conversations.call` does, and return its answer.
+
+        Raises:
+            CallError: there is no answer; its code says why.
+        """
+        link = self._exchange.links[route.way.link]
+        if link.state != "open":
+            raise CallError("link_down", f"{route.robot} is on link {link.name}, which is {link.state}: {link.reason}")
+        options = link.configuration.options
+        return await self.conversations.call(
+            self._robot(route),
+            command,
+            parameters,
+            timeout_s=timeout_s,
+            fresh_s=fresh_s,
+            retries=options.retries,
+            busy_poll_s=options.busy_poll_s,
+        )
+
+    def commands(self, route: Route) -> Sequence[Command]:
+        return self._profile(route).commands()
+
+    def robot_heard(self, route: Route) -> None:
+        for address in route.addresses:
+            search = self._searches.get(address)
+            if search is not None:
+                search.found.set()
+
+    def robot_gone(self, route: Route) -> None:
+        self._profiles.pop(route.robot, None)
+
+    def undelivered(self, frame: Frame, verdict: Verdict) -> None:
+        self.conversations.undelivered(frame, _dropped(frame.destination, verdict))
+
+    # conversation.Links
+
+    def send(self, frame: Frame, patience_s: float) -> CallError | None:
+        verdict = self._exchange.send(frame, self._clock(), patience_s)
+        return None if verdict is None or verdict == DELIVERED else _dropped(frame.destination, verdict)
+
+    def expire(self, link: str) -> None:
+        self._exchange.links[link].expire(self._clock() + _MOMENT_S)
+
+    def traffic(self, link: str) -> Traffic:
+        found = self._exchange.links[link]
+        return Traffic(found.frames_out, found.last_sent)
+
+    # Inside.
+
+    def _robot(self, route: Route) -> Robot:
+        """Who we are to the robot, who it is to us, and how a request becomes a frame between us."""
+        name, profile, way = str(route.robot), self._profile(route), route.way
+        codec = self._exchange.links[way.link].configuration.codec
+        if isinstance(codec, PsiuHexa.Options):
+            number = next(address for address in route.addresses if address.is_numbered)
+            own = Address.numbered(codec.local, codec.domain)
+            return Robot(
+                name, own, number, profile, lambda it: psiu_hexa.packet(own, number, it.payload), way.link, way.peer
+            )
+        own, address = self.name, route.robot
+        return Robot(
+            name,
+            own,
+            address,
+            profile,
+            lambda it: psiu_ascii.message(own, address, *it.payload.decode("ascii").split(" ")),
+            way.link,
+            way.peer,
+        )
+
+    def _profile(self, route: Route) -> Profile:
+        """What the robot of `route` understands; kept for as long as the robot is known."""
+        profile = self._profiles.get(route.robot)
+        if profile is None or profile.protocol != route.protocol:
+            profile = self._profiles[route.robot] = self._make_profile(route)
+        return profile
+
+    def _make_profile(self, route: Route) -> Profile:
+        options = self._exchange.links[route.way.link].configuration.options
+        if route.protocol == "psiu-hexa":
+            robot = self._robots.get(route.robot)
+            if robot is None:
+                return HexaProfile({}, options.timeout_s)
+            return HexaProfile(robot.nodes, options.timeout_s, robot.sensor_reply)
+        return PsiuProfile(timeout_s=options.timeout_s)
+
+    async def _told(self, command: str, request: CallRequest) -> Answer:
+        """A call to the broker itself."""
+        begun = asyncio.get_running_loop().time()
+        values: list[str | int | float]
+        match command, request.parameters:
+            case "discover", []:
+                values = list(await self._discover(request.timeout_s))
+            case "qualseunome", []:
+                values = [str(self.name)]
+            case "quantoscomandos", []:
+                values = [len(OWN_COMMANDS)]
+            case "exibecomando", [int(index)] if 1 <= index <= len(OWN_COMMANDS):
+                shown = OWN_COMMANDS[index - 1]
+                values = [shown.name, shown.ints, shown.floats, shown.chars]
+            case _:
+                names = ", ".join(each.name for each in OWN_COMMANDS)
+                raise CallError("unknown_command", f"{self.name} is the broker; it understands {names}")
+        elapsed_ms = round((asyncio.get_running_loop().time() - begun) * 1000, 3)
+        return Answer(values=values, elapsed_ms=elapsed_ms)
+
+    async def _seek(self, robot: Address, timeout_s: float | None) -> Route:
+        """Ask for an unknown robot by its name, and wait a moment for it.
+
+        Raises:
+            CallError: unknown_robot, or link_down where it was on a link that went down.
+        """
+        if not robot.is_numbered and robot != EVERYONE:
+            search = self._searches.setdefault(robot, _Search())
+            search.callers += 1
+            try:
+                if search.callers == 1:
+                    self._exchange.ask_for(robot, self._clock())
+                async with asyncio.timeout(min(SOUGHT_S, timeout_s or SOUGHT_S)):
+                    await search.found.wait()
+            except TimeoutError:
+                pass
+            finally:
+                search.callers -= 1
+                if not search.callers:
+                    del self._searches[robot]
+            route = self._router.find(robot)
+            if route is not None:
+                return route
+        departed = self._router.table.departed(robot)
+        if departed is None:
+            raise CallError("unknown_robot", f"no robot {robot} is known, and none answered to that name")
+        ago_s = self._clock() - departed.at
+        link = self._exchange.links[departed.link]
+        if link.state == "open":
+            raise CallError(
+                "unknown_robot", f"{robot} was last heard on {link.name}; it was given up {ago_s:.0f} s ago"
+            )
+        raise CallError("link_down", f"{robot} was on {link.name}, which went down {ago_s:.0f} s ago: {link.reason}")
+
+    async def _discover(self, timeout_s: float | None) -> list[str]:
+        """Ask where everyone may be asked who is there, then each robot for its commands.
+
+        Returns:
+            The names of all robots heard, of whom as much is known as could be learned in `timeout_s`.
+        """
+        now = self._clock()
+        try:
+            async with asyncio.timeout(timeout_s):
+                for link in self._exchange.links.values():
+                    wildcard = link.configuration.options.wildcard and link.codec.protocol == "psiu-ascii"
+                    if link.state == "open" and wildcard:
+                        self._exchange.ask_names(link, now)
+                await asyncio.sleep(LISTENING_S)
+                await asyncio.gather(*(self._inquire(route) for route in self._router.robots()))
+        except TimeoutError:
+            log.info("discovery: not every robot told its commands within %s s", timeout_s)
+        return [str(route.robot) for route in self._router.robots() if route.heard_at is not None]
+
+    async def _inquire(self, route: Route) -> None:
+        """Learn a robot's commands; a robot that does not answer has none for now."""
+        try:
+            profile = self._profile(route)
+            if not isinstance(profile, PsiuProfile):
+                await self.ask(route, "ping")
+                return
+            count = await self.ask(route, COUNT)
+            total = next((value for value in count.values if isinstance(value, int)), 0)
+            for index in range(1, min(total, COMMANDS_ASKED) + 1):
+                shown = await self.ask(route, SHOW, [index])
+                command = listed(shown.values)
+                if command is not None:
+                    profile.learn(command)
+        except CallError as error:
+            log.info("asking %s for its commands: %s", route.robot, error)
+
+
+def _dropped(robot: Address, verdict: Verdict) -> CallError:
+    code, text = _DROPPED.get(verdict, ("refused", verdict))
+    return CallError(code, f"{robot}: {text}")

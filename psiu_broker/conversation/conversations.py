@@ -1,0 +1,334 @@
+"""Calls to robots: one request under way per robot, its tries and its deadline, until an answer or a reason why not.
+
+A call goes through these states, and every wait ends at its deadline:
+
+    turn ──> quiet ──> sent ──reply──────────────> Answer
+                        │ ├──AGAIN──> settled ──> sent (bounded by `retries`)
+                        │ ├──BUSY───> AVAIL? every `busy_poll_s` ──FREE──> sent
+                        │ └──silence> sent again if it is a question, else outcome_unknown
+                        └──not possible, link down, shutting down: CallError
+
+Quiet: the robot owes no late reply that could be mistaken for the answer. A stop waits for neither turn nor quiet.
+All methods run on the event loop's thread; times are seconds of the loop's clock.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
+from datetime import UTC, datetime
+from math import inf
+from typing import Protocol
+
+from psiu_broker.conversation.complaints import Complaints, Traffic
+from psiu_broker.conversation.late_replies import LateReplies
+from psiu_broker.conversation.turns import Turns
+from psiu_broker.conversation.under_way import Robot, UnderWay
+from psiu_broker.errors import CallError, EncodeError
+from psiu_broker.frame import Address, Frame
+from psiu_broker.messages import Answer, Value
+from psiu_broker.profiles.profile import Notice, Reading, Reply, Request
+
+
+class Links(Protocol):
+    """What conversations need of the links. None of these waits."""
+
+    def send(self, frame: Frame, patience_s: float) -> CallError | None:
+        """Offer a frame to its link, where it may wait for `patience_s`; None, or why it cannot go.
+
+        What is dropped there after all is told to `Conversations.undelivered`.
+        """
+
+    def expire(self, link: str) -> None:
+        """Drop now what has waited on `link` for as long as it may."""
+
+    def traffic(self, link: str) -> Traffic: ...
+
+
+class Conversations:
+    """All calls of this broker to robots."""
+
+    def __init__(self, links: Links, *, retries: int = 2, busy_poll_s: float = 0.5, settle_s: float = 0.05) -> None:
+        """`settle_s`: how long a robot that did not understand is left alone; all its complaints until then are one."""
+        self._links = links
+        self._retries = retries
+        self._busy_poll_s = busy_poll_s
+        self._settle_s = settle_s
+        self._turns = Turns()
+        self._under_way: dict[Address, list[UnderWay]] = {}
+        self._late = LateReplies()
+        self._complaints = Complaints()
+        self._closed = False
+
+    async def call(
+        self,
+        robot: Robot,
+        command: str,
+        parameters: Sequence[Value],
+        *,
+        timeout_s: float | None = None,
+        fresh_s: float = inf,
+        retries: int | None = None,
+        busy_poll_s: float | None = None,
+    ) -> Answer:
+        """Tell `robot` a command and return its answer within `timeout_s`.
+
+        Without `timeout_s` the deadline is as long as all tries take. A command that has not left within
+        `fresh_s` is not sent; one that is to be fresh and waits for its turn gives way to a newer one like it.
+
+        Raises:
+            CallError: there is no answer; its code says why.
+        """
+        request = robot.profile.request(command, parameters)
+        retries = self._retries if retries is None else retries
+        tries = 1 + retries
+        if timeout_s is None:
+            timeout_s, patience_s = request.timeout_s * tries, request.timeout_s
+        else:
+            patience_s = max(request.timeout_s, timeout_s / tries) if request.question else timeout_s
+        call = _under_way(robot, command, request, timeout_s, fresh_s)
+        call.patience_s, call.retries, call.busy_poll_s = patience_s, retries, busy_poll_s or self._busy_poll_s
+        async with self._turn(call, replaceable=fresh_s < inf and not request.question):
+            await self._quiet(call)
+            reply, at = await self._ask(call)
+        elapsed_ms = round((at - call.begun) * 1000, 3)
+        return Answer(status=reply.status, values=list(reply.values), unit=reply.unit, elapsed_ms=elapsed_ms)
+
+    async def tell(self, robot: Robot, command: str, parameters: Sequence[Value], *, fresh_s: float) -> None:
+        """Send a command and go on: what the robot answers is nobody's.
+
+        It waits for its turn behind calls, so that its answer cannot end one of them, but for no answer: a stream
+        of set-points flows as fast as its link, and it is the next call that waits until the robot has answered
+        them. While a call holds the stream up, the newest of each command is kept, for at most `fresh_s`.
+
+        Raises:
+            CallError: it was not sent; its code says why.
+        """
+        request = robot.profile.request(command, parameters)
+        call = _under_way(robot, command, request, fresh_s, fresh_s)
+        async with self._turn(call, replaceable=True):
+            self._offer(call, request, call.leave_by)
+
+    def heard(self, frame: Frame, now: float) -> bool:
+        """Take a frame from a robot; True when it was an answer, to a call under way or an earlier request."""
+        if not self._under_way and not self._late:
+            return False
+        calls = self._under_way.get(frame.source, ())
+        if self._late.take(frame, now):
+            for call in calls:
+                call.woken.set()
+            return True
+        about: tuple[UnderWay, Reading] | None = None
+        for call in calls:
+            if not call.sent or frame.destination != call.robot.own:
+                continue
+            reading = call.robot.profile.read(call.request, frame)
+            if reading is not None and (about is None or about[0].has_reply):
+                about = call, reading
+        if about is None:
+            return False
+        about[0].answer(about[1], now)
+        return True
+
+    def complained(self, link: str, peer: object = None) -> None:
+        """Somebody there said in plain text that it did not understand, without saying who it is or what it was.
+
+        Questions and stops are sent again; anything else only where it can be about no other frame.
+        """
+        now = asyncio.get_running_loop().time()
+        traffic = self._links.traffic(link)
+        for call in [call for calls in self._under_way.values() for call in calls]:
+            robot = call.robot
+            if call.sending is None or robot.link != link or (robot.peer is not None and robot.peer != peer):
+                continue
+            if self._complaints.blame(call.sending, traffic, now):
+                call.answer(Notice.AGAIN, now)
+            elif call.request.question or call.is_stop:
+                call.hear(Notice.AGAIN, now)
+
+    def undelivered(self, frame: Frame, error: CallError) -> None:
+        """A frame that `Links.send` took will not reach its link after all; its call ends with `error`."""
+        self._late.undelivered(frame)
+        for call in self._under_way.get(frame.destination, ()):
+            call.woken.set()
+            if call.frame is frame:
+                call.sent -= 1
+                call.hear(error, 0.0)
+
+    def link_down(self, link: str, reason: str) -> None:
+        """End the calls under way on `link`."""
+        since = datetime.now(UTC).strftime("%H:%M:%S UTC")
+        for call in [call for calls in self._under_way.values() for call in calls]:
+            if call.robot.link == link:
+                unknown = call.sent and not call.request.question
+                doubt = "; whether it was done is unknown" if unknown else ""
+                text = f"link {link} is down since {since} ({reason}), before {call.robot.name} answered{doubt}"
+                call.hear(CallError("link_down", text), 0.0)
+
+    def pinging(self, address: Address) -> bool:
+        """A ping from `address` is, or may be, the answer to one of ours and so no question (PSIU HEXA row 6)."""
+        return any(call.sent and call.request.subject == "ping" for call in self._under_way.get(address, ()))
+
+    def close(self) -> None:
+        """End every call with shutting_down, and refuse new ones."""
+        self._closed = True
+        for calls in self._under_way.values():
+            for call in calls:
+                call.hear(_shutting_down(), 0.0)
+
+    @asynccontextmanager
+    async def _turn(self, call: UnderWay, *, replaceable: bool) -> AsyncIterator[None]:
+        """Wait until no other call to this robot is under way, unless it is a stop."""
+        self._refuse_when_closed()
+        if call.is_stop:
+            with self._hearing(call):
+                yield
+            return
+        robot = call.robot
+        async with self._turns.turn(
+            robot.address, name=robot.name, command=call.command, until=call.leave_by, replaceable=replaceable
+        ):
+            self._refuse_when_closed()
+            with self._hearing(call):
+                yield
+
+    @contextmanager
+    def _hearing(self, call: UnderWay) -> Iterator[None]:
+        """Have the call hear its robot; the replies that are missing when it ends are owed."""
+        address = call.robot.address
+        self._under_way.setdefault(address, []).append(call)
+        try:
+            yield
+        finally:
+            self._under_way[address].remove(call)
+            if not self._under_way[address]:
+                del self._under_way[address]
+            if call.frame is not None:
+                now, until = asyncio.get_running_loop().time(), call.sent_at + call.request.timeout_s
+                missing = call.sent - call.answered
+                self._late.expect(call.frame, call.robot.profile, call.request, missing, now, until)
+
+    async def _quiet(self, call: UnderWay) -> None:
+        """Wait until the robot owes nothing that could be mistaken for the answer, unless it is a stop."""
+        robot, loop = call.robot, asyncio.get_running_loop()
+        while not call.is_stop:
+            until = self._late.owed_until(robot.address, robot.profile, call.request, loop.time())
+            if until is None:
+                return
+            if loop.time() >= call.leave_by:
+                text = f"{robot.name} still owes an answer to an earlier command; {call.command} was not sent"
+                raise CallError("expired", text)
+            await call.rest(min(until, call.leave_by))
+            if call.heard:  # nothing is sent yet: it can only be the end of the call
+                await call.next(0.0)
+
+    async def _ask(self, call: UnderWay) -> tuple[Reply, float]:
+        loop = asyncio.get_running_loop()
+        tries = 0
+        while True:
+            until = min(loop.time() + call.patience_s, call.deadline)
+            self._offer(call, call.request, until if tries and call.request.question else min(until, call.leave_by))
+            tries += 1
+            reading, at = await self._after_sending(call, until)
+            if reading is Notice.FREE:
+                tries -= 1
+            elif isinstance(reading, Reply):
+                return reading, at
+            elif reading is Notice.IMPOSSIBLE:
+                raise CallError("impossible", f"{call.robot.name} says that {call.command} is impossible")
+            elif reading is None and not call.request.question:
+                raise _outcome_unknown(call, loop.time())
+            elif tries > call.retries or loop.time() >= call.deadline:
+                raise _no_answer(call, tries, understood=reading is None)
+
+    async def _after_sending(self, call: UnderWay, until: float) -> tuple[Reading | None, float]:
+        """What came of one try: a reply, None for silence, AGAIN once the robot is quiet, FREE after it was busy."""
+        reading, at = await self._next_but(call, until, Notice.FREE)
+        if reading is None:
+            self._links.expire(call.robot.link)
+            reading, at = await self._next_but(call, at, Notice.FREE)
+        if reading is not None and call.sending is not None:
+            self._complaints.settle(call.sending, self._links.traffic(call.robot.link))
+        if reading is Notice.AGAIN:
+            settled = min(asyncio.get_running_loop().time() + self._settle_s, call.deadline)
+            reading, at = await self._next_but(call, settled, Notice.FREE, Notice.AGAIN)
+            reading = reading or Notice.AGAIN
+        if reading is Notice.BUSY:
+            reading, at = await self._until_free(call)
+        return reading, at
+
+    async def _next_but(self, call: UnderWay, until: float, *ignored: Notice) -> tuple[Reading | None, float]:
+        while True:
+            reading, at = await call.next(until)
+            if reading not in ignored:
+                return reading, at
+
+    async def _until_free(self, call: UnderWay) -> tuple[Reading, float]:
+        """FREE, or the reply that came all the same.
+
+        Raises:
+            CallError: busy, until the deadline or for lack of a way to ask.
+        """
+        loop = asyncio.get_running_loop()
+        poll = call.robot.profile.poll
+        next_poll = loop.time() + call.busy_poll_s
+        asked = False
+        while poll is not None and loop.time() < call.deadline:
+            if loop.time() >= next_poll:
+                next_poll = loop.time() + call.busy_poll_s
+                self._offer(call, poll, min(next_poll, call.deadline))
+                asked = True
+            reading, at = await call.next(min(next_poll, call.deadline))
+            if isinstance(reading, Reply):
+                return reading, at
+            if reading is Notice.FREE and asked and loop.time() < call.deadline:
+                return reading, at
+            if reading is Notice.IMPOSSIBLE and asked:
+                break
+        raise CallError("busy", f"{call.robot.name} is busy and did not do {call.command}")
+
+    def _offer(self, call: UnderWay, request: Request, until: float) -> None:
+        """Send one frame of the call, which may leave up to `until`.
+
+        Raises:
+            CallError: it cannot go.
+        """
+        robot, now = call.robot, asyncio.get_running_loop().time()
+        if now >= until:
+            raise CallError("expired", f"it was too late for {call.command}; it was not sent to {robot.name}")
+        try:
+            frame = robot.build(request)
+        except EncodeError as error:
+            raise CallError("refused", f"{call.command} cannot be sent to {robot.name}: {error}") from error
+        before = self._links.traffic(robot.link)
+        call.frame, call.sent_at, call.sent = frame, now, call.sent + 1
+        refused = self._links.send(frame, until - now)
+        if refused is not None:
+            call.sent -= 1
+            raise refused
+        call.sending = self._complaints.sending(robot.link, before, self._links.traffic(robot.link))
+
+    def _refuse_when_closed(self) -> None:
+        if self._closed:
+            raise _shutting_down()
+
+
+def _under_way(robot: Robot, command: str, request: Request, timeout_s: float, fresh_s: float) -> UnderWay:
+    begun = asyncio.get_running_loop().time()
+    leave_by = begun + min(timeout_s, fresh_s)
+    return UnderWay(robot, command, request, begun, begun + timeout_s, leave_by)
+
+
+def _outcome_unknown(call: UnderWay, now: float) -> CallError:
+    text = f"{call.robot.name} did not answer {call.command} in {now - call.begun:.3g} s: it may have been done or not"
+    return CallError("outcome_unknown", f"{text}, so it was not sent again")
+
+
+def _no_answer(call: UnderWay, tries: int, *, understood: bool) -> CallError:
+    times = "1 try" if tries == 1 else f"{tries} tries"
+    if understood:
+        return CallError("no_answer", f"no answer from {call.robot.name} after {times}")
+    return CallError("no_answer", f"{call.robot.name} did not understand {call.command} after {times}")
+
+
+def _shutting_down() -> CallError:
+    return CallError("shutting_down", "the broker is shutting down")

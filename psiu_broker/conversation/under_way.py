@@ -1,0 +1,95 @@
+"""A call whose turn it is: what it is to send, how far it has come, and what it has heard."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from psiu_broker.conversation.complaints import Sending
+from psiu_broker.errors import CallError
+from psiu_broker.frame import Address, Frame
+from psiu_broker.profiles.profile import Profile, Reading, Reply, Request
+from psiu_broker.routing.outbox import STOP_WORDS
+
+_HEARD_KEPT: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot as calls reach it: its name, who we are to it, who it is to us, what it understands, and where it is."""
+
+    name: str
+    own: Address
+    address: Address
+    profile: Profile
+    build: Callable[[Request], Frame]
+    link: str
+    peer: object = None
+
+
+@dataclass(slots=True, eq=False)
+class UnderWay:
+    """A call, from when it waits for its turn."""
+
+    robot: Robot
+    command: str
+    request: Request
+    begun: float
+    deadline: float
+    leave_by: float
+    """After this it is too late for it to leave, and for a motion to be sent again."""
+    patience_s: float = 0.0
+    retries: int = 0
+    busy_poll_s: float = 0.0
+    sent: int = 0
+    answered: int = 0
+    sent_at: float = 0.0
+    frame: Frame | None = None
+    sending: Sending | None = None
+    heard: deque[tuple[Reading | CallError, float]] = field(default_factory=deque)
+    woken: asyncio.Event = field(default_factory=asyncio.Event)
+
+    @property
+    def is_stop(self) -> bool:
+        return self.request.subject in STOP_WORDS
+
+    @property
+    def has_reply(self) -> bool:
+        return any(isinstance(reading, Reply) for reading, _ in self.heard)
+
+    def answer(self, reading: Reading, now: float) -> None:
+        """Hear what can only be about a frame of this call."""
+        self.answered = min(self.sent, self.answered + 1)
+        self.hear(reading, now)
+
+    def hear(self, reading: Reading | CallError, now: float) -> None:
+        """Keep it for `next`; when a robot talks faster than that, the first words count."""
+        if len(self.heard) < _HEARD_KEPT or isinstance(reading, CallError):
+            self.heard.append((reading, now))
+            self.woken.set()
+
+    async def next(self, until: float) -> tuple[Reading | None, float]:
+        """The next thing heard and when, or None at `until`.
+
+        Raises:
+            CallError: the call was ended from outside.
+        """
+        loop = asyncio.get_running_loop()
+        while not self.heard and loop.time() < until:
+            await self.rest(until)
+        if not self.heard:
+            return None, loop.time()
+        reading, at = self.heard.popleft()
+        if isinstance(reading, CallError):
+            raise reading
+        return reading, at
+
+    async def rest(self, until: float) -> None:
+        """Wait until woken, at most until `until`."""
+        self.woken.clear()
+        try:
+            async with asyncio.timeout_at(until):
+                await self.woken.wait()
+        except TimeoutError:
+            pass
