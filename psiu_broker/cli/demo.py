@@ -79,6 +79,8 @@ def demo() -> None:
         raise Failure(f"the demo failed: {error}") from error
     except TimeoutError as error:
         raise Failure(f"the demo failed: it was not through within {WHOLE_S:.0f} s") from error
+    except BrokenPipeError:
+        raise  # nobody looks any more
     except (PsiuError, OSError) as error:
         raise Failure(f"the demo failed: {error}") from error
 

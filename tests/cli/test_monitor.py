@@ -1,0 +1,108 @@
+"""One terminal watches while another calls."""
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from psiu_broker.messages import Card, Decoded, RawFrame
+
+Start = Callable[..., Any]
+
+
+@pytest.fixture
+def watch(lab: Any, start: Start) -> Callable[..., Any]:
+    @contextmanager
+    def watching(*words: str, sign: str, robot: str = "MNERIM", command: str = "distancia") -> Iterator[Any]:
+        """`psiu monitor`, once it has seen a call: nobody is told when it begins to listen."""
+        monitor = start("psiu", "monitor", *words, env=lab.env)
+        for _ in range(100):
+            lab.run("call", robot, command)
+            if any(sign in line for line in tuple(monitor.out)):
+                break
+            assert monitor.popen.poll() is None, monitor.err
+        yield monitor
+        monitor.signal(signal.SIGINT)
+        assert monitor.ended() == 0
+        assert monitor.err == []
+
+    return watching
+
+
+def test_a_person_reads_when_who_what_and_where_until_ctrl_c(watch: Any, lab: Any) -> None:
+    with watch(sign="distancia 42") as monitor:
+        lab.run("call", "BRACO", "garra", "30")
+        monitor.until(r"^\d\d:\d\d:\d\d\.\d\d\d  MNERIM → base  distancia 42  radio$")
+        monitor.until(r"^\S+  0x00 → BRACO  garra 29\.76 deg \(node 4, signal 42\)  @self$")
+        monitor.until(r"BRACO → 0x00  ack  arm$")
+
+
+def test_a_program_reads_one_object_a_line(watch: Any, lab: Any) -> None:
+    with watch("--json", sign='"command":"distancia"') as monitor:
+        lab.run("call", "MNERIM", "trava")
+        monitor.until('"falha"')
+        lab.run("discover")
+        monitor.until('"link_state"')
+    seen = [json.loads(line) for line in monitor.out]
+    frames = [Decoded.model_validate(each) for each in seen if "kind" in each]
+    cards = [Card.model_validate(each) for each in seen if "link_state" in each]
+    assert len(frames) + len(cards) == len(seen)
+    assert cards
+    answer = next(each for each in seen if each.get("status") == "falha")
+    assert answer["key"] == "psiu/MNERIM/base/trava"
+
+
+def test_one_robot_is_watched_by_its_name_and_hears_under_its_address(watch: Any, lab: Any) -> None:
+    with watch("BRACO", "--json", sign='"node"', robot="BRACO", command="sonar") as monitor:
+        lab.run("call", "MNERIM", "distancia")
+        lab.run("call", "BRACO", "garra", "7")
+        monitor.until('"command":"garra"')
+    told = [json.loads(line) for line in monitor.out]
+    assert all("0x12" in (each.get("source"), each.get("destination"), each.get("address")) for each in told)
+
+
+def test_a_key_with_wildcards_is_taken_as_it_is(watch: Any, lab: Any) -> None:
+    with watch("psiu/*/*/trava", sign="trava", command="trava") as monitor:
+        lab.run("call", "MNERIM", "distancia")
+        lab.run("call", "MNERIM", "trava")
+    assert all("trava" in line for line in monitor.out)
+
+
+@pytest.mark.parametrize("link", ["radio", "all"])
+def test_the_raw_frames_of_a_link_come_with_verdict_and_bytes(watch: Any, lab: Any, link: str) -> None:
+    with watch("--raw", link, "--json", sign='"direction":"in"') as monitor:
+        lab.run("call", "MNERIM", "distancia")
+        monitor.until('"direction":"out"')
+    frames = [RawFrame.model_validate(json.loads(line)) for line in monitor.out]
+    assert any(frame.direction == "out" and bytes.fromhex(frame.wire).startswith(b"MNERIM ") for frame in frames)
+    assert ({frame.link for frame in frames} == {"radio"}) == (link == "radio")
+
+
+def test_raw_frames_are_one_line_for_a_person(watch: Any, lab: Any) -> None:
+    with watch("--raw", "radio", sign="distancia") as monitor:
+        lab.run("call", "MNERIM", "distancia")
+        monitor.until(r"^\S+  radio in  MNERIM → base  distancia  answered  [0-9a-f]+$")
+        monitor.until(r"^\S+  radio out  base → MNERIM  distancia  delivered  [0-9a-f]+$")
+
+
+def test_a_closed_pipe_ends_it_quietly(lab: Any, start: Start) -> None:
+    reading, writing = os.pipe()
+    monitor = start("psiu", "monitor", env=lab.env, stdout=writing)
+    os.close(reading)
+    os.close(writing)
+    for _ in range(100):
+        lab.run("call", "MNERIM", "distancia")
+        if monitor.popen.poll() is not None:
+            break
+    assert (monitor.ended(), monitor.err) == (0, [])
+
+
+def test_a_wrong_key_is_told_on_one_line(lab: Any) -> None:
+    refused = lab.run("monitor", "psiu//x")
+    assert refused.exit_code == 3
+    assert "not a key" in refused.stderr
+    assert lab.run("monitor", "MNERIM", "--raw", "radio").exit_code == 2
