@@ -180,7 +180,7 @@ class PsiuHexa(Codec):
 
     def _number(self, address: Address) -> int:
         if not 0 <= address.number <= 255:
-            raise EncodeError(f"{address or 'nobody'} has no PSIU HEXA address")
+            raise EncodeError(f"{str(address) or 'nobody'} has no PSIU HEXA address")
         if address.domain != self.options.domain:
             raise EncodeError(
                 f"{address} is not in the domain {self.options.domain or '(the default one)'} of this link"
