@@ -38,13 +38,7 @@ class Client:
             BusError: nobody answers there within `OPEN_TIMEOUT_S`.
         """
         self.keys: Final = Keys(prefix)
-        try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(_configuration(connect))))
-        except zenoh.ZError as error:
-            if "Unable to connect" in str(error):
-                places = " or ".join(connect)
-                raise BusError(f"no broker answers at {places}; is psiu-broker running?") from error
-            raise BusError(f"zenoh: {plain(error)}") from error
+        self._session = _first_that_answers(list(connect))
 
     def __enter__(self) -> "Client":
         return self
@@ -153,12 +147,26 @@ class Client:
         return found
 
 
-def _configuration(connect: Sequence[str]) -> dict[str, object]:
+def _first_that_answers(connect: list[str]) -> zenoh.Session:
+    """Raises BusError."""
+    for turn in range(len(connect)):
+        # A Zenoh client tries the first endpoint again and again, and the others only if that connection is lost later.
+        endpoints = connect[turn:] + connect[:turn]
+        config = json.dumps(_configuration(endpoints, OPEN_TIMEOUT_S / len(connect)))
+        try:
+            return zenoh.open(zenoh.Config.from_json5(config))
+        except zenoh.ZError as error:
+            if "Unable to connect" not in str(error):
+                raise BusError(f"zenoh: {plain(error)}") from error
+    raise BusError(f"no broker answers at {' or '.join(connect)}; is psiu-broker running?")
+
+
+def _configuration(endpoints: list[str], timeout_s: float) -> dict[str, object]:
     return {
         "mode": "client",
         "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": int(OPEN_TIMEOUT_S * 1000),
+            "endpoints": endpoints,
+            "timeout_ms": int(timeout_s * 1000),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         },
