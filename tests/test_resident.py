@@ -1,0 +1,358 @@
+"""The broker as a robot, and as the voice of others: the whole way from a link's bytes and back; no bus, no sockets."""
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import pytest
+from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.identity import identity
+from psiu_broker.config.tables import (
+    BrokerConfiguration,
+    Configuration,
+    LinkConfiguration,
+    RobotConfiguration,
+    ZenohConfiguration,
+)
+from psiu_broker.errors import CallError
+from psiu_broker.exchange import Exchange
+from psiu_broker.frame import Address, Way
+from psiu_broker.link import Link
+from psiu_broker.messages import Answer, CallRequest
+from psiu_broker.profiles import Node
+from psiu_broker.profiles.rarely import REMEMBERED
+from psiu_broker.resident import Resident
+from psiu_broker.routing.router import Router
+from psiu_broker.routing.table import Binding, Route
+
+MNERIM = Address.named("MNERIM")
+NODES = {"garra": Node(node=4, type="servo"), "sonar": Node(node=7, type="distance")}
+
+
+def words(name: str = "radio", adapter: MemoryAdapter | None = None, **options: object) -> LinkConfiguration:
+    return configuration(name, "psiu-ascii", adapter, None, **{"greet": False, **options})
+
+
+def arm(**options: object) -> LinkConfiguration:
+    codec: dict[str, object] = {"topology": "point-to-point", "remote": 0x12}
+    return configuration("arm", "psiu-hexa", None, codec, **{"greet": False, **options})
+
+
+def wire(source: str, destination: str, *said: str) -> bytes:
+    frame = psiu_ascii.message(Address.named(source), Address.named(destination), *said)
+    return codec_of(configuration()).encode(frame)
+
+
+def arm_says(payload: bytes) -> bytes:
+    far_end = configuration("arm", "psiu-hexa", codec={"topology": "point-to-point", "remote": 0, "local": 0x12})
+    return codec_of(far_end).encode(psiu_hexa.packet(Address.numbered(0x12), Address.numbered(0), payload))
+
+
+def said(transport: MemoryTransport) -> list[str]:
+    """Destination, message and sender of each frame written."""
+    return [" ".join((part := data.decode().split())[:1] + part[2:-1]) for data in transport.wires]
+
+
+class Lab:
+    """A resident between links of lists; `BRACO` is at the end of a link `arm` if there is one."""
+
+    def __init__(self, *links: LinkConfiguration, name: str = "base", braco: str = "BRACO") -> None:
+        own = {Address.named(name): "psiu-ascii"}
+        robots: dict[str, RobotConfiguration] = {}
+        bindings: tuple[Binding, ...] = ()
+        if any(link.name == "arm" for link in links):
+            number = Address.numbered(0x12)
+            own[Address.numbered(0)] = "psiu-hexa"
+            robots[braco] = RobotConfiguration(braco, "arm", "psiu-hexa", number, None, NODES, "node-0")
+            bindings = (Binding(Address.named(braco), number, Way("arm"), "psiu-hexa"),)
+        self.router = Router(own, bindings, identity, heard=self._heard)
+        self.exchange = Exchange(Address.named(name), self.router)
+        made = Configuration(
+            BrokerConfiguration(name=name), ZenohConfiguration(), {link.name: link for link in links}, robots
+        )
+        self.resident = self.exchange.resident = Resident(made, self.exchange)
+        self.exchange.withdrawn = self.resident.robot_gone
+        directory = Directory({name}, {0})
+        self.links: dict[str, Link] = {}
+        self.far: dict[str, MemoryTransport] = {}
+        for link in links:
+            unaddressed = link.name == "arm"
+            self.links[link.name] = Link(
+                link, lambda link=link: codec_of(link, directory), self.exchange, unaddressed=unaddressed
+            )
+            self.exchange.add(self.links[link.name])
+            self.connect(link.name, MemoryTransport(link.adapter.ends))
+
+    def _heard(self, route: Route) -> None:
+        self.resident.robot_heard(route)
+        for address in route.addresses:
+            self.exchange.release(address, time.monotonic())
+
+    def connect(self, link: str, transport: MemoryTransport) -> None:
+        self.far[link] = transport
+        self.links[link].connected(transport)
+
+    def hears(self, link: str, data: bytes, peer: object = None) -> None:
+        self.links[link].received(data, peer)
+
+    async def call(self, robot: str, command: str, *parameters: int, timeout_s: float | None = None) -> Answer:
+        request = CallRequest(parameters=list(parameters), timeout_s=timeout_s)
+        return await self.resident.call(Address.parse(robot), command, request)
+
+    async def tell(self, robot: str, command: str, *parameters: int) -> None:
+        await self.resident.tell(Address.parse(robot), command, CallRequest(parameters=list(parameters)))
+
+    def know(self, robot: Address = MNERIM, link: str = "radio") -> None:
+        self.hears(link, wire(str(robot), "base", "parafrente", "sucesso"))
+
+
+class Labs:
+    def __init__(self) -> None:
+        self.all: list[Lab] = []
+
+    def __call__(self, *links: LinkConfiguration, **names: str) -> Lab:
+        self.all.append(Lab(*links, **names))
+        return self.all[-1]
+
+
+@pytest.fixture
+async def labs() -> AsyncIterator[Labs]:
+    labs = Labs()
+    yield labs
+    for lab in labs.all:
+        await lab.resident.close()
+
+
+async def until(true: Callable[[], object]) -> None:
+    async with asyncio.timeout(5):
+        while not true():  # noqa: ASYNC110 - what is written is a list, not an event
+            await asyncio.sleep(0.001)
+
+
+async def refused(call: Awaitable[Any]) -> str:
+    with pytest.raises(CallError) as caught:
+        await call
+    return caught.value.code
+
+
+class Cable(MemoryTransport):
+    """The other broker's end hears what is written, soon."""
+
+    far: Link
+
+    def write(self, data: bytes, peer: object) -> bool:
+        asyncio.get_running_loop().call_soon(self.far.received, data, None)
+        return super().write(data, peer)
+
+
+def join(one: Lab, other: Lab) -> tuple[Cable, Cable]:
+    cables = Cable(), Cable()
+    cables[0].far, cables[1].far = other.links["radio"], one.links["radio"]
+    one.connect("radio", cables[0])
+    other.connect("radio", cables[1])
+    return cables
+
+
+async def settled() -> None:
+    """Everything that goes on by itself has ended, or goes on for ever."""
+    for _ in range(200):
+        await asyncio.sleep(0)
+
+
+# Another robot's voice.
+
+
+async def test_of_commands_to_a_silent_arm_none_arrives_late(labs: Labs) -> None:
+    lab = labs(words(), arm(timeout_s=0.2, max_age_s=0.15))
+    for degrees in ("10", "20", "30"):
+        lab.hears("radio", wire("PC", "BRACO", "garra", degrees))
+    await until(lambda: not lab.resident._tasks)
+    assert len(lab.far["arm"].wires) == 1
+    assert said(lab.far["radio"]) == ["PC garra falha BRACO"]
+
+
+async def test_the_newest_command_to_a_busy_arm_is_the_one_that_arrives(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for degrees in ("10", "20", "90"):
+        lab.hears("radio", wire("PC", "BRACO", "garra", degrees))
+    await settled()
+    for _ in range(2):
+        lab.hears("arm", arm_says(b"A"))
+        await settled()
+    assert [data[1:-1] for data in lab.far["arm"].wires] == [b"\x04\x0e", b"\x04\x7f"]
+    assert said(lab.far["radio"]) == ["PC garra falha BRACO", *["PC garra sucesso BRACO"] * 2]
+
+
+async def test_two_brokers_with_an_arm_each_soon_fall_silent(labs: Labs) -> None:
+    one, other = labs(words(), arm(), name="A", braco="BRACO1"), labs(words(), arm(), name="B", braco="BRACO2")
+    for message in (
+        "xyz",
+        "xyz falha",
+        "qualseunome",
+        "quantoscomandos",
+        "exibecomando 9",
+        "sonar 42",
+        "garra sucesso",
+    ):
+        cables = join(one, other)
+        one.hears("radio", wire("BRACO2", "BRACO1", *message.split()))
+        await settled()
+        assert sum(len(cable.wires) for cable in cables) <= 2, message
+
+
+async def test_an_answer_to_a_robot_spoken_for_is_not_answered(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for message in ("garra sucesso", "garra falha", "quantoscomandos 4"):
+        lab.hears("radio", wire("PC", "BRACO", *message.split()))
+    await settled()
+    assert lab.far["radio"].wires == lab.far["arm"].wires == []
+    assert lab.exchange.accounts["radio"].fates["answered"] == 3
+
+
+async def test_one_refusal_is_said_once_in_a_while(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for degrees in ("500", "600", "700"):
+        lab.hears("radio", wire("PC", "BRACO", "garra", degrees))
+    lab.hears("radio", wire("PC", "BRACO", "perna"))
+    await settled()
+    assert said(lab.far["radio"]) == ["PC garra falha BRACO", "PC perna falha BRACO"]
+
+
+async def test_what_is_said_for_others_is_not_logged_frame_by_frame(
+    labs: Labs, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab = labs(words(), arm())
+    lab.hears("radio", wire("PC", "BRACO", "garra", "500"))
+    await settled()
+    assert said(lab.far["radio"])
+    assert not [record for record in caplog.records if record.name.startswith("psiu_broker.resident")]
+
+
+async def test_a_robot_of_bytes_is_asked_its_name_by_words_and_tells_it(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for _ in range(3):
+        lab.hears("radio", wire("PC", "BRACO", "qualseunome"))
+    assert said(lab.far["radio"]) == ["PC qualseunome BRACO"]
+    assert lab.far["arm"].wires == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "answer"),
+    [(bytes((2, 0, 1, 7)), "PC complex 0x 07 BRACO"), (bytes((1, 1, 7)), "PC complex 07 BRACO")],
+)
+async def test_an_arms_complex_answer_reaches_a_sender_of_words(labs: Labs, payload: bytes, answer: str) -> None:
+    lab = labs(words(), arm())
+    lab.hears("radio", wire("PC", "BRACO", "complex", "0xa1b2"))
+    await settled()
+    lab.hears("arm", arm_says(payload))
+    await settled()
+    assert said(lab.far["radio"]) == [answer]
+
+
+# Its own voice.
+
+
+async def test_the_robots_of_a_group_answer_our_question_from_their_own_addresses(labs: Labs) -> None:
+    lab = labs(words("wifi", MemoryDatagrams(ends=("255.255.255.255:9000",))))
+    lab.exchange.ask_names(lab.links["wifi"], time.monotonic())
+    for number, robot in enumerate(("MNERIM", "BETA")):
+        peer = f"10.0.0.{number}:9000"
+        lab.far["wifi"].ends.append(peer)
+        lab.hears("wifi", wire(robot, "base", "qualseunome"), peer)
+    assert said(lab.far["wifi"]) == ["?? qualseunome base"]
+    lab.hears("wifi", wire("BETA", "base", "qualseunome"), peer)
+    assert said(lab.far["wifi"])[1:] == ["BETA qualseunome base"]
+
+
+async def test_naks_to_many_peers_are_remembered_in_bounds(labs: Labs) -> None:
+    lab = labs(configuration("field", "psiu-hexa", MemoryDatagrams(), None, greet=False, nak=True))
+    for number in range(2 * REMEMBERED):
+        peer = ("10.0.0.1", number)
+        lab.far["field"].ends.append(peer)
+        for _ in range(2):
+            lab.hears("field", bytes((3, 0, 4, 99)), peer)
+        lab.links["field"].peer_lost(peer)
+    assert len(lab.resident._naks) == REMEMBERED
+
+
+# Calls.
+
+
+async def test_a_call_to_stop_passes_the_call_under_way(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    motion = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 500))
+    stop = asyncio.ensure_future(lab.call("MNERIM", "pare"))
+    await settled()
+    assert said(lab.far["radio"]) == ["MNERIM parafrente 500 base", "MNERIM pare base"]
+    lab.hears("radio", wire("MNERIM", "base", "pare", "sucesso"))
+    assert (await stop).status == "sucesso"
+    motion.cancel()
+
+
+@pytest.mark.parametrize("foreign", [True, False])
+async def test_a_motion_is_sent_again_only_on_a_complaint_of_its_own(labs: Labs, foreign: bool) -> None:
+    lab = labs(words(), words("wifi", MemoryDatagrams(ends=(1,))))
+    lab.know()
+    motion = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 50, timeout_s=0.3))
+    await settled()
+    if foreign:
+        lab.hears("wifi", wire("PC", "MNERIM", "distancia"), 1)
+    lab.hears("radio", b"CHECKSUM NAO BATEU!\r\n")
+    assert await refused(motion) == "outcome_unknown"
+    assert said(lab.far["radio"]).count("MNERIM parafrente 50 base") == (1 if foreign else 2)
+
+
+async def test_a_command_that_never_left_is_said_to_have_expired(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    lab.far["radio"].full = True
+    assert await refused(lab.call("MNERIM", "parafrente", 5, timeout_s=0.1)) == "expired"
+    assert lab.links["radio"].outbox.size == 0
+
+
+async def test_a_put_does_not_end_a_call_and_its_answer_is_not_refused(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    call = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 500))
+    await settled()
+    put = asyncio.ensure_future(lab.tell("MNERIM", "distancia"))
+    await settled()
+    assert said(lab.far["radio"]) == ["MNERIM parafrente 500 base"]
+    lab.hears("radio", wire("MNERIM", "base", "parafrente", "sucesso"))
+    await call
+    await put
+    lab.hears("radio", wire("MNERIM", "base", "distancia", "42"))
+    assert said(lab.far["radio"]) == ["MNERIM parafrente 500 base", "MNERIM distancia base"]
+
+
+async def test_a_put_too_old_for_its_link_is_not_sent(labs: Labs) -> None:
+    lab = labs(words(max_age_s=0.05))
+    lab.know()
+    call = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 500))
+    await settled()
+    assert await refused(lab.tell("MNERIM", "luz", 1)) == "expired"
+    call.cancel()
+    assert said(lab.far["radio"]) == ["MNERIM parafrente 500 base"]
+
+
+async def test_a_discovery_keeps_its_deadline_and_tells_who_is_known_by_then(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    for timeout_s in (0.1, 0.7):
+        begun = time.monotonic()
+        assert (await lab.call("base", "discover", timeout_s=timeout_s)).values == ["MNERIM"]
+        assert time.monotonic() - begun < timeout_s + 0.3
+
+
+async def test_a_discovery_asks_nobody_where_everyone_may_not_be_asked(labs: Labs) -> None:
+    lab = labs(words(), words("quiet", wildcard=False))
+    await lab.call("base", "discover", timeout_s=0.05)
+    assert said(lab.far["radio"]) == ["?? qualseunome base"]
+    assert lab.far["quiet"].wires == []
