@@ -16,7 +16,7 @@ Event = Frame | Malformed
 class Directory:
     """The robots that the broker knows of now. Codecs only read it; it changes under them.
 
-    `names` settles where a name with spaces begins; `numbers` (of one domain) tells a found
+    `names` are those with spaces in them, to settle where such a name begins; `numbers` (of one domain) tells a found
     PSIU HEXA packet from noise whose CRC fits by luck.
     """
 
@@ -32,6 +32,8 @@ class Codec(ABC):
     """What the user may write for this protocol in ``[links.NAME]``."""
     dialect: str
     """The exact form on the wire; a frame heard in the same dialect is forwarded as it came."""
+    pending: bool = False
+    """True while bytes wait for more."""
     silence_s: float
     """A silence this long ends whatever was begun: the link then calls `flush`."""
 
@@ -46,11 +48,6 @@ class Codec(ABC):
     @abstractmethod
     def flush(self, now: float) -> Sequence[Event]:
         """A boundary (silence, end of a datagram): give up or accept what is begun. Never raises."""
-
-    @property
-    @abstractmethod
-    def pending(self) -> bool:
-        """True while bytes wait for more."""
 
     @abstractmethod
     def encode(self, frame: Frame) -> bytes:

@@ -97,16 +97,10 @@ class PsiuAscii(Codec):
         self._subjects: dict[bytes, str] = {}
         self._run = Run(strict=options.strict)
         self._noise = Noise()
-        self._begun = False
-
-    @property
-    def pending(self) -> bool:
-        """True while bytes wait for more."""
-        return self._begun
 
     def decode(self, data: bytes, now: float) -> Sequence[Event]:
         """The frames that `data` completes, and in one `Malformed` each run of bytes between them."""
-        if not self._begun:
+        if not self.pending:
             frame = self._whole(data)
             if frame is not None:
                 return [frame]
@@ -120,17 +114,17 @@ class PsiuAscii(Codec):
             else:
                 self._end_run(events, boundary=False)
                 self._noise.add(piece[0], events)
-        self._begun = len(self._run.text) > 0 or self._noise.size > 0
+        self.pending = len(self._run.text) > 0 or self._noise.size > 0
         self.silence_s = RIPE_S if self._run.fits else self._silence_s
         return events
 
     def flush(self, now: float) -> Sequence[Event]:
         """Settle or give up what was begun."""
-        if not self._begun:
+        if not self.pending:
             return ()
         events: list[Event] = []
         self._end_line(events)
-        self._begun = False
+        self.pending = False
         self.silence_s = self._silence_s
         return events
 
@@ -176,15 +170,15 @@ class PsiuAscii(Codec):
         sender = size - 6 - len(words[-2])
         if len(words) > 5:
             # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
-            if not data.isascii() or not (text := data.decode()).isprintable():
+            if not data.isascii() or not data.decode().isprintable() or self._may_begin_a_name(words):
                 return None
-            start = sender
-            for word in words[-3:2:-1]:
-                start -= len(word) + 1
-                if text[start:-6] in self._directory.names:
-                    return None
         payload = data[len(words[0]) + 5 : sender - 1]
         return _make(Frame, (source, destination, subject, payload, PROTOCOL, data, _CANONICAL, ""))
+
+    def _may_begin_a_name(self, words: list[bytes]) -> bool:
+        """Whether one of the parameters in `words` and all behind it, up to the checksum, is a known name."""
+        names = self._directory.names
+        return bool(names) and any(b" ".join(words[at:-1]).decode() in names for at in range(3, len(words) - 2))
 
     def _sender(self, text: str, start: int, space: int, end: int) -> int:
         """The space before the sender's name, which ends at `end`: the longest known one, else the word after `space`.

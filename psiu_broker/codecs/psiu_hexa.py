@@ -115,14 +115,9 @@ class PsiuHexa(Codec):
         """Why the step was lost; empty while in step."""
         self._noise = Noise()
 
-    @property
-    def pending(self) -> bool:
-        """True while bytes wait for more."""
-        return bool(self._begun or self._reason)
-
     def decode(self, data: bytes, now: float) -> Sequence[Event]:
         """The packets that `data` completes, and in one `Malformed` each run of bytes between them (PSIU HEXA 1)."""
-        if not self._begun and not self._reason:
+        if not self.pending:
             # One whole packet and nothing else: what nearly every datagram and most reads are.
             carried = self._carried
             length = len(data)
@@ -141,7 +136,7 @@ class PsiuHexa(Codec):
     def flush(self, now: float) -> Sequence[Event]:
         """Give up what was begun, after a search for packets inside it; whatever follows is in step."""
         events: list[Event] = []
-        if self._begun or self._reason:
+        if self.pending:
             self._search(b"", events, now, closed=True)
         if self._reassembly:
             events += self._given_up(self._reassembly.expire(now))
@@ -238,6 +233,7 @@ class PsiuHexa(Codec):
         if closed:
             self._noise.end(self._reason, events)
             self._reason = ""
+        self.pending = bool(self._begun or self._reason)
 
     def _next_find(self, buffer: bytes, at: int, *, closed: bool) -> int:
         """Where, from `at` on, a packet of a possible size for (or from) a known robot begins, or may yet."""
