@@ -144,6 +144,7 @@ async def test_who_waits_for_a_late_answer_hears_that_the_link_went_down_or_the_
         error = await refused(waiting)
         assert error.code == code
         assert "unknown" not in str(error)
+    assert set(robots.payloads) == {b"parafrente 100"}
 
 
 @jumping
@@ -318,6 +319,34 @@ async def test_a_motion_that_is_to_be_fresh_is_not_sent_again_when_a_busy_robot_
     robots.script = lambda frame: [(0.1, b"F" if frame.payload == b"?" and now() - robots.begun > 3 else b"B")]
     assert (await refused(robots.hexa("garra", 10, fresh_s=2))).code == "expired"
     assert robots.payloads.count(b"\x04\x0e") == 1
+
+
+@jumping
+async def test_a_motion_that_was_not_understood_too_long_ago_is_not_sent_again_and_a_question_is() -> None:
+    robots = Robots()
+    robots.script = lambda frame: [(0.6, b"N" if len(robots.sent) != 3 else bytes((0, 7)))]
+    assert (await refused(robots.hexa("garra", 10, fresh_s=0.5))).code == "expired"
+    assert (await robots.hexa("sonar", fresh_s=0.5)).values == [7]
+    assert robots.payloads == [b"\x04\x0e", *[b"\x07\x00"] * 2]
+
+
+@jumping
+async def test_a_newer_command_that_comes_just_as_the_older_gives_up_is_heard() -> None:
+    robots = Robots()
+    call = asyncio.ensure_future(robots.hexa("garra", 1))
+    await asyncio.sleep(0)
+
+    async def newer() -> None:
+        await asyncio.sleep(0.5)
+        await robots.conversations.tell(robots.of_bytes(), "garra", [3], fresh_s=2)
+
+    later = asyncio.ensure_future(newer())
+    await asyncio.sleep(0)
+    assert (await refused(robots.conversations.tell(robots.of_bytes(), "garra", [2], fresh_s=0.5))).code == "expired"
+    robots.says(b"A")
+    await call
+    await later
+    assert robots.payloads == [b"\x04\x01", b"\x04\x04"]
 
 
 # Complaints.

@@ -255,6 +255,19 @@ async def test_an_arms_complex_answer_reaches_a_sender_of_words(labs: Labs, payl
     assert said(lab.far["radio"]) == [answer]
 
 
+async def test_an_answer_too_long_for_words_is_a_falha(labs: Labs) -> None:
+    fragments = {"topology": "point-to-point", "fragment": True}
+    link = configuration("arm", "psiu-hexa", None, {**fragments, "remote": 0x12}, greet=False)
+    far_end = configuration("arm", "psiu-hexa", None, {**fragments, "remote": 0, "local": 0x12})
+    lab = labs(words(), link)
+    lab.hears("radio", wire("PC", "BRACO", "complex", "0xa1b2"))
+    await settled()
+    fields = psiu_hexa.packet(Address.numbered(0x12), Address.numbered(0), bytes((2, 255, 255)) + bytes(510))
+    lab.hears("arm", codec_of(far_end).encode(fields))
+    await settled()
+    assert said(lab.far["radio"]) == ["PC complex falha BRACO"]
+
+
 # Its own voice.
 
 
@@ -314,6 +327,20 @@ async def test_a_command_that_never_left_is_said_to_have_expired(labs: Labs) -> 
     lab.know()
     lab.far["radio"].full = True
     assert await refused(lab.call("MNERIM", "parafrente", 5, timeout_s=0.1)) == "expired"
+    assert lab.links["radio"].outbox.size == 0
+
+
+async def test_an_outbox_that_reads_its_clock_a_moment_later_still_tells_what_never_left(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    lab.far["radio"].full = True
+    calling = lab.resident._calling
+    moment = 1000.0
+    calling._clock = lambda: moment
+    frame = psiu_ascii.message(Address.named("base"), MNERIM, "parafrente", "5")
+    assert calling.send(frame, 0.1) is None
+    moment += 0.0999
+    calling.expire("radio")
     assert lab.links["radio"].outbox.size == 0
 
 

@@ -226,7 +226,8 @@ class Conversations:
         tries = 0
         while True:
             until = min(loop.time() + call.patience_s, call.deadline)
-            self._offer(call, call.request, until if tries and call.request.question else min(until, call.leave_by))
+            asked_again = call.sent and call.request.question
+            self._offer(call, call.request, until if asked_again else min(until, call.leave_by))
             tries += 1
             reading, at = await self._after_sending(call, until)
             if reading is Notice.FREE:
