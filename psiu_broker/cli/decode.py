@@ -60,7 +60,6 @@ def decode(text: tuple[str, ...], protocol: str | None, binary: bool, as_json: b
             print_line(_frame(event) if isinstance(event, Frame) else _malformed(event, spoken))
         else:
             click.echo(_line(event, spoken))
-            sys.stdout.flush()
     if wrong or not frames:
         if not wrong and not as_json:
             click.echo("there are no bytes", err=True)

@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import socket
-import sys
 import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -94,10 +93,10 @@ async def _show() -> None:
             await stage.relay()
             await stage.translate()
             await stage.close_the_books()
-    _say("")
+    click.echo("")
     took_s = asyncio.get_running_loop().time() - begun
-    _say(styled(f"All as it should be, in {took_s:.1f} s.", fg="green", bold=True))
-    _say("Now with robots of your own: psiu-broker run --help, psiu sim --help.")
+    click.echo(styled(f"All as it should be, in {took_s:.1f} s.", fg="green", bold=True))
+    click.echo("Now with robots of your own: psiu-broker run --help, psiu sim --help.")
 
 
 class Stage:
@@ -125,11 +124,11 @@ class Stage:
     async def ready(cls, folder: Path) -> AsyncIterator["Stage"]:
         """The stage, with all that is on it running."""
         stage = cls(folder)
-        _say(styled("One broker, three simulated robots, three kinds of link", bold=True))
-        _say(f"  MNERIM  speaks PSIU ASCII on a pseudo-terminal, as on a serial port: {stage.radio.path}")
-        _say(f"  BETA    speaks PSIU ASCII on UDP: {stage.beta_at}")
-        _say(f"  BRACO   speaks PSIU HEXA on a second pseudo-terminal: {stage.arm.path}")
-        _say(f"  base    the broker; programs connect to {stage.endpoint}")
+        click.echo(styled("One broker, three simulated robots, three kinds of link", bold=True))
+        click.echo(f"  MNERIM  speaks PSIU ASCII on a pseudo-terminal, as on a serial port: {stage.radio.path}")
+        click.echo(f"  BETA    speaks PSIU ASCII on UDP: {stage.beta_at}")
+        click.echo(f"  BRACO   speaks PSIU HEXA on a second pseudo-terminal: {stage.arm.path}")
+        click.echo(f"  base    the broker; programs connect to {stage.endpoint}")
         async with Simulation(stage.radio, stage.wifi, stage.arm):
             await stage.broker.start()
             try:
@@ -169,7 +168,7 @@ class Stage:
         await self._seen("MNERIM", "base", "parafrente", status="sucesso")
         if self.mnerim.position.x != 100:
             raise NotAsItShould(f"MNERIM is at {self.mnerim.position}, not at x = 100 cm")
-        _say(f"  {answer_line('MNERIM', answer)}: it is at x = 100 cm now")
+        click.echo(f"  {answer_line('MNERIM', answer)}: it is at x = 100 cm now")
 
     async def relay(self) -> None:
         order = self.beta.command("MNERIM", "giradireita", 90)
@@ -180,7 +179,7 @@ class Stage:
         await self._seen("MNERIM", "BETA", "giradireita", status="sucesso")
         if self.mnerim.position.heading != 270:
             raise NotAsItShould(f"MNERIM is at {self.mnerim.position}, not turned to the right")
-        _say("  BETA heard sucesso; MNERIM looks to the right")
+        click.echo("  BETA heard sucesso; MNERIM looks to the right")
 
     async def translate(self) -> None:
         order = self.beta.command("BRACO", "garra", 45)
@@ -192,7 +191,7 @@ class Stage:
         signal = self.braco.signals[GARRA]
         if signal != round(45 * 127 / 90):
             raise NotAsItShould(f"the signal of garra is {signal}")
-        _say(f"  BETA heard sucesso; garra is at 45 degrees, which BRACO knows as signal {signal}")
+        click.echo(f"  BETA heard sucesso; garra is at 45 degrees, which BRACO knows as signal {signal}")
 
     async def close_the_books(self) -> None:
         _step(5, "Where every frame went", "psiu robots, psiu links, psiu ledger")
@@ -201,9 +200,9 @@ class Stage:
         told = (await asyncio.to_thread(self.client.ask, "ledger"))["base"]
         ledger = Ledger.model_validate(told)
         show_robots(cards, drawn=True)
-        _say("")
+        click.echo("")
         show_links([("base", Link.model_validate(link)) for link in links], drawn=True)
-        _say("")
+        click.echo("")
         show_ledger([("base", ledger)], drawn=True)
         if not ledger.balances:
             raise NotAsItShould("the ledger does not balance")
@@ -267,19 +266,14 @@ class Listener:
                 message = read_message(payload)
                 if kind == "put":
                     self._seen.append(message)
-                    _say(f"    {message_line(key, message, NAMES)}")
+                    click.echo(f"    {message_line(key, message, NAMES)}")
         except (PsiuError, BrokenPipeError):
             return  # the client was closed, or nobody reads
 
 
-def _say(text: str) -> None:
-    click.echo(text)
-    sys.stdout.flush()
-
-
 def _step(number: int, text: str, how: str) -> None:
-    _say("")
-    _say(f"{styled(f'{number}. {text}', bold=True)}   [{how}]")
+    click.echo("")
+    click.echo(f"{styled(f'{number}. {text}', bold=True)}   [{how}]")
 
 
 def _free_port(kind: socket.SocketKind) -> int:

@@ -60,7 +60,6 @@ def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
                 if wanted(message):
                     names.learn(message)
                     click.echo(_json(at, message) if connection.as_json else message_line(at, message, names.known))
-                    sys.stdout.flush()
         except BrokenPipeError:
             closed_pipe_is_fine()
 

@@ -27,15 +27,13 @@ def on_terminal() -> bool:
 
 
 def print_json(value: Any) -> None:
-    """One JSON value: indented for a reader at a terminal, else on one line, at once."""
+    """One JSON value: indented for a reader at a terminal, else on one line."""
     click.echo(json.dumps(value, ensure_ascii=False, indent=2 if on_terminal() else None))
-    sys.stdout.flush()
 
 
 def print_line(value: Any) -> None:
-    """One JSON value on a line of its own, at once: for what comes one by one."""
+    """One JSON value on a line of its own: for what comes one by one."""
     click.echo(json.dumps(value, ensure_ascii=False))
-    sys.stdout.flush()
 
 
 def print_rows(rows: Iterable[Sequence[Cell]]) -> None:

@@ -1,7 +1,6 @@
 """What a simulated robot hears, says and does, told as it happens."""
 
 import asyncio
-import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -91,6 +90,5 @@ class Journal:
             line = f"{local:%H:%M:%S}.{local.microsecond // 1000:03d}  {text}"
         try:
             click.echo(line)
-            sys.stdout.flush()
         except BrokenPipeError:
             self.ended.set()

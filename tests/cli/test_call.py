@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from psiu_broker.messages import Answer, Card, Refusal
+from psiu_broker.bus.client import Client
+from psiu_broker.messages import Answer, CallRequest, Card, Refusal
 
 
 def test_sucesso_is_told_and_exits_0(lab: Any) -> None:
@@ -56,6 +57,15 @@ def test_negative_numbers_are_arguments(lab: Any, words: tuple[str, ...]) -> Non
     lab.braco.until('"name":"garra","signal":192')
 
 
+def test_numbers_are_sent_as_numbers_and_the_deadline_with_them(lab: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[CallRequest] = []
+    answer = Answer(elapsed_ms=1)
+    monkeypatch.setattr(Client, "call", lambda client, robot, command, request: asked.append(request) or answer)
+    assert lab.run("call", "MNERIM", "liga", "1", "-2.5", "x1", "--timeout", "3").exit_code == 0
+    assert asked == [CallRequest(parameters=[1, -2.5, "x1"], timeout_s=3)]
+    assert [type(value) for value in asked[0].parameters] == [int, float, str]
+
+
 def test_what_is_no_number_stays_text(lab: Any) -> None:
     assert lab.run("call", "MNERIM", "liga", "1", "x").exit_code == 0
     lab.mnerim.until('"subject":"liga","parameters":\\["1","x"\\]')
@@ -65,7 +75,8 @@ def test_a_mistyped_option_never_reaches_a_robot(lab: Any) -> None:
     refused = lab.run("call", "MNERIM", "liga", "--tiemout", "3")
     assert refused.exit_code == 2
     assert "--tiemout" in refused.stderr
-    assert lab.run("call", "MNERIM", "distancia", "--timeout", "-1").exit_code == 2
+    negative = lab.run("call", "MNERIM", "distancia", "--timeout", "-1")
+    assert (negative.exit_code, "-1.0 is not in the range" in negative.stderr) == (2, True)
 
 
 def test_an_address_is_called_like_a_name(lab: Any) -> None:

@@ -68,6 +68,8 @@ def test_what_does_not_happen_fails_with_one_clear_line(
     daemon: Run, monkeypatch: pytest.MonkeyPatch, name: str, robot: type, said: str
 ) -> None:
     monkeypatch.setattr(demo, name, robot)
+    impatient = demo.CONFIGURATION.replace("topology", "timeout_s = 0.1\ntopology")
+    monkeypatch.setattr(demo, "CONFIGURATION", impatient)
     failed = daemon("demo")
     assert failed.exit_code == 1
     assert failed.stderr.startswith(f"psiu-broker: the demo failed: {said}")

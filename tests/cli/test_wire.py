@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from click.testing import Result
+from crccheck.crc import Crc8Smbus
 
 Run = Callable[..., Result]
 
@@ -61,6 +62,23 @@ def test_frames_between_noise_are_all_found(tool: Run) -> None:
     ]
     assert events[1]["parameters"] == [100]
     assert bytes.fromhex(events[1]["wire"]) == FORWARD
+
+
+def test_a_packet_of_bytes_is_found_behind_noise(tool: Run) -> None:
+    decoded = tool("decode", "--protocol", "psiu-hexa", "ff", "010206043f", check(0x3F))
+    assert decoded.output.splitlines()[1:] == ["psiu-hexa  0x01 → 0x02  node 4 signal 63"]
+
+
+def check(signal: int) -> str:
+    """The check byte of 01 02 06 04 and the signal, from an implementation of its own."""
+    return f"{Crc8Smbus.calc(bytes((1, 2, 6, 4, signal))):02x}"
+
+
+def test_of_two_protocols_the_one_that_leaves_less_over_is_told(tool: Run) -> None:
+    packet = f"010206043f{check(0x3F)}"
+    told = tool("decode", packet + FORWARD.hex()).output.splitlines()
+    assert [line.split()[0] for line in told] == ["psiu-ascii", "psiu-ascii"]
+    assert [line.split()[0] for line in tool("decode", packet).output.splitlines()] == ["psiu-hexa"]
 
 
 def test_nothing_at_all_is_no_frame(tool: Run) -> None:
