@@ -7,7 +7,8 @@ which changes nothing and which `why` asks too.
 """
 
 from collections.abc import Callable, Collection, Hashable
-from typing import Final, Literal, NamedTuple, cast
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
 
 from psiu_broker.frame import EVERYONE, NOBODY, Address, Frame, Way
 from psiu_broker.routing.duplicates import Duplicates
@@ -20,7 +21,8 @@ SELF: Final = Way("@self")
 Action = Literal["forward", "flood", "answer", "ask", "translate", "drop"]
 
 
-class Decision(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Decision:
     """What to do with a frame.
 
     forward: to `hops`. flood: to `hops`, and the broker answers too. answer: it is for the broker.
@@ -92,9 +94,9 @@ class Router:
             return IMPOSSIBLE_SOURCE
         target = self._routes.get(frame.destination)
         if target is not None and target.protocol == frame.protocol and target.way != arrived:
-            decision = target.decision
-            if decision is not None:
-                return cast(Decision, decision)
+            ready: Decision | None = target.decision
+            if ready is not None:
+                return ready
         return self.decide(frame.destination, frame.protocol, arrived)
 
     def decide(self, destination: Address, protocol: str, arrived: Way) -> Decision:

@@ -1,7 +1,7 @@
 """Who was heard where, and when."""
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from psiu_broker.frame import Address, Way
 
@@ -32,7 +32,7 @@ class Route:
         self.protocol = protocol
         self.pinned = pinned
         """True for a route of the configuration: it neither ages nor moves to another link."""
-        self.decision: object = None
+        self.decision: Any = None
         """What the router answers for a frame in the robot's own protocol, while its link is up."""
         self.first_heard: float | None = None
         self.heard_at: float | None = None
