@@ -262,11 +262,14 @@ async def test_a_motion_is_never_repeated_on_silence(lab: Lab) -> None:
 
 async def test_why_tells_the_decision_and_its_reasons(lab: Lab) -> None:
     there = lab.broker.why(Address.named("BETA"), Address.named("MNERIM"))
-    assert there.delivered
+    assert (there.delivered, there.verdict) == (True, "delivered")
     assert any("radio" in step and "learned" in step for step in there.steps)
     nowhere = lab.broker.why(Address.named("BETA"), Address.numbered(0x77))
     assert not nowhere.delivered
     assert nowhere.verdict == "no_route"
+    unheard = lab.broker.why(Address.named("BETA"), Address.named("NINGUEM"))
+    assert (unheard.delivered, unheard.verdict) == (False, "no_route")
+    assert any("asked for" in step for step in unheard.steps)
 
 
 async def test_a_port_that_is_taken_is_one_clear_line(lab: Lab) -> None:

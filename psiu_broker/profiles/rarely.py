@@ -7,21 +7,23 @@ REMEMBERED: Final = 256
 
 
 class Rarely:
-    """A short memory of when each key last had its turn: the latest `REMEMBERED` keys."""
+    """A short memory of the turns that each key has left: the latest `REMEMBERED` keys."""
 
     def __init__(self) -> None:
-        self._last: dict[Hashable, float] = {}
+        self._left: dict[Hashable, tuple[float, float]] = {}
 
     def __len__(self) -> int:
-        return len(self._last)
+        return len(self._left)
 
-    def may(self, key: Hashable, now: float, every_s: float) -> bool:
-        """True at most once every `every_s` for one key; `now` is in seconds on any steady clock."""
-        last = self._last.get(key)
-        if last is not None and now - last < every_s:
-            return False
-        self._last.pop(key, None)
-        if len(self._last) >= REMEMBERED:
-            del self._last[next(iter(self._last))]
-        self._last[key] = now
-        return True
+    def may(self, key: Hashable, now: float, every_s: float, burst: int = 1) -> bool:
+        """True at most `burst` times at once, and once every `every_s` in the long run, for one key.
+
+        `now` is in seconds on any steady clock.
+        """
+        left, at = self._left.pop(key, (float(burst), now))
+        left = min(float(burst), left + (now - at) / every_s)
+        may = left >= 1.0
+        if len(self._left) >= REMEMBERED:
+            del self._left[next(iter(self._left))]
+        self._left[key] = (left - may, now)
+        return may

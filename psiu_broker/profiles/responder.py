@@ -1,8 +1,7 @@
 """The broker as a robot: what it answers to frames addressed to itself, and for robots that cannot list commands.
 
 Two brokers, or a broker and a robot that takes any frame for a command, must never keep each other talking: an
-answer is never answered, and what may be one that came too late is answered at most once in a while, longer than
-a frame may be on its way there and back.
+answer is never answered, and what may be one that came too late only a few times, and then once in a while.
 """
 
 from collections.abc import Sequence
@@ -15,10 +14,14 @@ from psiu_broker.profiles.hexa import AVAILABLE, FREE, WTF
 from psiu_broker.profiles.psiu import COUNT, NAME, QUESTIONS, SHOW, Said, canonical, said, text
 from psiu_broker.profiles.rarely import Rarely
 
-PING_EVERY_S: Final = 2.0
-"""A ping within this of our answer to one may be the answer to that (PSIU HEXA row 6 allows one a 100 ms)."""
+PING_EVERY_S: Final = 0.1
+"""A ping sooner after our answer to one may be the answer to that (PSIU HEXA row 6)."""
+PINGS_AT_ONCE: Final = 10
+PINGS_EVERY_S: Final = 1.0
+"""In the long run; two brokers far apart would else take each other's answers for pings without end."""
+NAMES_AT_ONCE: Final = 4
 NAME_EVERY_S: Final = 30.0
-"""A name within this of ours may be the answer to it; who asks everyone is always told."""
+"""In the long run, for one who asks us by our name; who asks everyone is always told."""
 REFUSE_EVERY_S: Final = 2.0
 """As long as a robot has to answer: its late value must not be met with a falha that it answers in turn."""
 
@@ -45,7 +48,7 @@ class Responder:
 
     def listed(self, frame: Frame, name: str, commands: Sequence[Command], now: float) -> Frame | None:
         """`listing` for `name`, a robot that the broker speaks for; its name is told once in a while."""
-        if canonical(said(frame).command) == NAME and not self._rarely.may((frame.source, name), now, NAME_EVERY_S):
+        if canonical(said(frame).command) == NAME and not self._may_tell(frame, name, now):
             return None
         return listing(frame, name, commands)
 
@@ -54,13 +57,20 @@ class Responder:
         key = (frame.source, name, said(frame).command)
         return refusal(frame, name) if self._rarely.may(key, now, REFUSE_EVERY_S) else None
 
+    def _may_tell(self, frame: Frame, name: str, now: float) -> bool:
+        return self._rarely.may((frame.source, name), now, NAME_EVERY_S, NAMES_AT_ONCE)
+
+    def _may_ping(self, robot: Address, now: float) -> bool:
+        soon = self._rarely.may((robot, "soon"), now, PING_EVERY_S)
+        return soon and self._rarely.may(robot, now, PINGS_EVERY_S, PINGS_AT_ONCE)
+
     def _words(self, frame: Frame, now: float) -> Frame | None:
         words = said(frame)
         if not words.command:
             return None
         if canonical(words.command) == NAME:
             # Question and answer look alike, and a robot may take our answer for a question.
-            asked = frame.destination == EVERYONE or self._rarely.may((frame.source, self.name), now, NAME_EVERY_S)
+            asked = frame.destination == EVERYONE or self._may_tell(frame, self.name, now)
             return _say(self.name, frame, NAME) if asked else None
         if words.answer:
             return None
@@ -72,7 +82,7 @@ class Responder:
     def _packet(self, frame: Frame, now: float, pinging: bool) -> Frame | None:
         payload = frame.payload
         if len(payload) == 0:
-            if pinging or not self._rarely.may(frame.source, now, PING_EVERY_S):
+            if pinging or not self._may_ping(frame.source, now):
                 return None
             return psiu_hexa.packet(frame.destination, frame.source, b"")
         if len(payload) == 1:
