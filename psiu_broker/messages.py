@@ -6,7 +6,7 @@ Fields are added, never renamed. Times are UTC, RFC 3339 with microseconds.
 from datetime import datetime
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, StrictFloat, StrictInt, StrictStr
 
 from psiu_broker.errors import CallCode
 
@@ -80,7 +80,8 @@ class CallRequest(Message):
 
     model_config = ConfigDict(extra="forbid")
 
-    parameters: list[Value] = Field(default=[], max_length=64)
+    # Strict: true is no number.
+    parameters: list[StrictInt | StrictFloat | StrictStr] = Field(default=[], max_length=64)
     timeout_s: float | None = Field(default=None, gt=0, le=3600)
 
 
@@ -180,6 +181,9 @@ class Status(Message):
     robots: int
     zenoh_id: str
     listen: list[str]
+    published: int = Field(default=0, description="messages put on the bus since it was opened")
+    unpublished: int = Field(default=0, description="messages that could not be put")
+    refused_puts: int = Field(default=0, description="commands put without waiting and refused: nobody was told")
 
 
 class Health(Message):
