@@ -11,6 +11,7 @@ from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries
+from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session
 from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Directory
@@ -28,7 +29,7 @@ from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
 from psiu_broker.routing.duplicates import Duplicates
-from psiu_broker.routing.router import Router
+from psiu_broker.routing.router import SELF, Router
 
 log = logging.getLogger(__name__)
 
@@ -114,6 +115,7 @@ class Broker:
 
     def status(self) -> Status:
         links = self.exchange.links.values()
+        bus = self._bus
         return Status(
             broker=self.configuration.broker.name,
             version=__version__,
@@ -122,8 +124,11 @@ class Broker:
             links_open=sum(link.state == "open" for link in links),
             links=len(links),
             robots=len(self.exchange.router.robots()),
-            zenoh_id=self._bus.session.zenoh_id if self._bus else "",
+            zenoh_id=bus.session.zenoh_id if bus else "",
             listen=list(self.configuration.zenoh.listen),
+            published=bus.publisher.puts if bus else 0,
+            unpublished=bus.publisher.failures if bus else 0,
+            refused_puts=bus.calls.refused_puts if bus else 0,
         )
 
     def links(self) -> Sequence[LinkMessage]:
@@ -158,6 +163,13 @@ class Broker:
     def why(self, a: Address, b: Address) -> Why:
         return self.report.why(a, b)
 
+    def robots(self) -> Iterable[Address]:
+        return [route.robot for route in self.exchange.router.robots()]
+
+    def card(self, robot: Address) -> Card | None:
+        route = self.exchange.router.find(robot)
+        return None if route is None or route.way == SELF else self.report.card(route)
+
     def cards(self) -> Mapping[Address, Card]:
         return self.report.cards()
 
@@ -189,7 +201,7 @@ class Broker:
             directory = self._directory(address.domain)
             if address.is_numbered:
                 directory.numbers.add(address.number)
-            else:
+            elif " " in address.name:
                 directory.names.add(address.name)
 
     # Inside: putting together.
@@ -204,7 +216,7 @@ class Broker:
     def _directory(self, domain: str) -> Directory:
         directory = self._directories.get(domain)
         if directory is None:
-            directory = self._directories[domain] = Directory({str(self._own_name)})
+            directory = self._directories[domain] = Directory()
         return directory
 
     def _link(self, configuration: LinkConfiguration) -> Link:
@@ -242,18 +254,24 @@ class Broker:
 
     async def _tick(self) -> None:
         while True:
-            now = time.monotonic()
-            self._ticked = now
-            self.exchange.expire(now)
-            for link in self.exchange.links.values():
-                if self._seen.get(link.name) != link.since:
-                    self._seen[link.name] = link.since
-                    self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
-            if self._bus is not None:
-                for route in self._changed.values():
-                    self._bus.publisher.publish_card(route.robot, self.report.card(route))
-                self._changed.clear()
+            try:
+                self._look_after(time.monotonic())
+            except Exception:  # whatever is wrong with one robot's card must not stop the clock of all
+                log.exception("a tick failed")
             await asyncio.sleep(TICK_S)
+
+    def _look_after(self, now: float) -> None:
+        """Drop what is too late, and put the cards that changed."""
+        self._ticked = now
+        self.exchange.expire(now)
+        for link in self.exchange.links.values():
+            if self._seen.get(link.name) != link.since:
+                self._seen[link.name] = link.since
+                self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
+        if self._bus is not None:
+            for route in self._changed.values():
+                self._bus.publisher.publish_card(route.robot, self.report.card(route))
+            self._changed.clear()
 
     def _checks(self) -> dict[str, bool]:
         links = {task.get_name(): not task.done() for task in self._link_tasks}
@@ -268,7 +286,7 @@ class Broker:
         checks = self._checks()
         try:
             checks["zenoh round trip"] = (
-                self._bus is not None and await self._bus.queries.round_trip(ROUND_TRIP_S) < ROUND_TRIP_S
+                self._bus is not None and await self._bus.round_trip.measure(ROUND_TRIP_S) < ROUND_TRIP_S
             )
         except BusError as error:
             log.warning("health: %s", error)
@@ -289,11 +307,14 @@ class Broker:
 class _Bus:
     """One session with everything that is declared on it."""
 
-    def __init__(self, session: Session, publisher: Publisher, calls: Calls, queries: Queries) -> None:
+    def __init__(
+        self, session: Session, publisher: Publisher, calls: Calls, queries: Queries, round_trip: RoundTrip
+    ) -> None:
         self.session = session
         self.publisher = publisher
         self.calls = calls
         self.queries = queries
+        self.round_trip = round_trip
 
     @classmethod
     async def open(cls, broker: Broker, lost: Callable[[], None]) -> "_Bus":
@@ -308,6 +329,7 @@ class _Bus:
                 await Publisher.open(session, keys, name, _describer(broker.configuration)),
                 await Calls.open(session, keys, broker.call, broker.send),
                 await Queries.open(session, keys, name, broker),
+                await RoundTrip.open(session, keys, name),
             )
         except BusError:
             await session.close()

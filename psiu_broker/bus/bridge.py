@@ -20,7 +20,7 @@ WAITING_MAX: Final = 4096
 """What may wait for the loop; the oldest gives way (a query that gives way ends unanswered)."""
 
 TURN_MAX: Final = 256
-"""What one turn of the loop handles, so that links are not starved."""
+"""What one turn of the loop handles where each item is little work, so that links are not starved."""
 
 
 class Bridge(Generic[T, Kept]):
@@ -39,13 +39,14 @@ class Bridge(Generic[T, Kept]):
         *,
         name: str,
         failed: Callable[[BaseException], None],
+        turn_max: int = TURN_MAX,
     ) -> None:
-        self.dropped = 0
         self._loop = asyncio.get_running_loop()
         self._source = source
         self._sift = sift
         self._handle = handle
         self._failed = failed
+        self._turn_max = turn_max
         self._waiting: deque[Kept] = deque(maxlen=WAITING_MAX)
         self._idle = True
         self._thread = threading.Thread(target=self._read, name=f"psiu-{name}", daemon=True)
@@ -73,8 +74,6 @@ class Bridge(Generic[T, Kept]):
             self._failed(error)
 
     def _pass_on(self, kept: Kept) -> bool:
-        if len(self._waiting) == WAITING_MAX:
-            self.dropped += 1
         self._waiting.append(kept)
         if self._idle:
             self._idle = False
@@ -86,7 +85,7 @@ class Bridge(Generic[T, Kept]):
 
     def _drain(self) -> None:
         self._idle = True
-        for _ in range(min(len(self._waiting), TURN_MAX)):
+        for _ in range(min(len(self._waiting), self._turn_max)):
             try:
                 self._handle(self._waiting.popleft())
             except Exception:

@@ -10,16 +10,18 @@ import logging
 import math
 import threading
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 import zenoh
 from pydantic import ValidationError
 
 from psiu_broker.bus.keys import Keys
-from psiu_broker.bus.session import Session, json_of, plain
+from psiu_broker.bus.replies import Replies
+from psiu_broker.bus.session import Session, aside, json_of, plain
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Answer, CallRequest, Refusal
+from psiu_broker.messages import Answer, CallRequest
 
 logger = logging.getLogger(__name__)
 
@@ -36,10 +38,11 @@ PAYLOAD_MAX: Final = 65_536
 RING: Final = 1024
 
 _ANSWER: Final = json_of("Answer")
-_REFUSAL: Final = json_of("Refusal")
+_STOPPING: Final = "the broker is stopping; the command may have been carried out"
 
 
 class _Accepted(NamedTuple):
+    key: str
     robot: Address
     command: str
     request: CallRequest
@@ -55,7 +58,9 @@ class Calls:
         self._keys = keys
         self._call = call
         self._send = send
+        self._replies = Replies(session, "bus-call")
         self._room = threading.BoundedSemaphore(AT_ONCE_MAX)
+        self._closed = False
         self._tasks: set[asyncio.Task[None]] = set()
 
     @classmethod
@@ -75,7 +80,7 @@ class Calls:
 
         calls = cls(session, keys, call, send)
         try:
-            queryable, subscriber = await asyncio.to_thread(declare)
+            queryable, subscriber = await aside(declare)
         except zenoh.ZError as error:
             raise BusError(f"zenoh: {plain(error)}") from error
         session.declared(queryable)
@@ -85,19 +90,22 @@ class Calls:
         return calls
 
     async def close(self) -> None:
-        """Answer every call under way with ``shutting_down``; before `Session.close`."""
+        """Answer every call under way, and each that comes later, with ``shutting_down``; before `Session.close`."""
+        self._closed = True
+        await asyncio.sleep(0)  # a task that is cancelled before its first step says nothing
         for task in tuple(self._tasks):
             task.cancel()
         if self._tasks:
             await asyncio.wait(self._tasks)
+        await self._replies.sent()
 
     def _sift_query(self, query: zenoh.Query) -> _Accepted | None:
-        """What of `query` the loop must see; a refusal is answered here, off the loop."""
+        """What of `query` the loop must see."""
         try:
             _refuse_parameters(query.parameters)
             return self._accepted(str(query.key_expr), query.payload, query)
         except CallError as error:
-            refuse(query, error)
+            self._replies.turn_away(query, error)
             return None
 
     def _sift_put(self, sample: zenoh.Sample) -> _Accepted | None:
@@ -117,44 +125,43 @@ class Calls:
         request = read_request(payload.to_bytes() if payload is not None else b"")
         if not self._room.acquire(blocking=False):
             raise CallError("busy", f"{AT_ONCE_MAX} calls are under way already")
-        return _Accepted(robot, command, request, query)
+        return _Accepted(key, robot, command, request, query)
 
     def _begin(self, accepted: _Accepted) -> None:
         work = self._serve_put(accepted) if accepted.query is None else self._serve(accepted, accepted.query)
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._ended)
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        self._room.release()
+        task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, accepted: _Accepted, query: zenoh.Query) -> None:
+        reply = await self._outcome(accepted, query)
+        reply.add_done_callback(lambda _: self._room.release())
+
+    async def _outcome(self, accepted: _Accepted, query: zenoh.Query) -> "Future[None]":
+        """The reply to `query`, on its way."""
+        if self._closed:
+            return self._replies.refuse(query, CallError("shutting_down", "the broker is stopping"))
         try:
             answer = await self._call(accepted.robot, accepted.command, accepted.request)
-            reply = self._session.off_loop(_answer, query, answer)
         except CallError as error:
-            reply = self._session.off_loop(refuse, query, error)
+            return self._replies.refuse(query, error)
         except asyncio.CancelledError:
-            stopping = CallError("shutting_down", "the broker is stopping; the command may have been carried out")
-            reply = self._session.off_loop(refuse, query, stopping)
+            return self._replies.refuse(query, CallError("shutting_down", _STOPPING))
         except Exception as error:
             logger.exception("a call to %s %s failed inside the broker", accepted.robot, accepted.command)
             failed = CallError("outcome_unknown", f"the broker failed ({type(error).__name__}); its log says how")
-            reply = self._session.off_loop(refuse, query, failed)
-        try:
-            await reply
-        except BaseException as error:
-            if not self._session.panicked(error):
-                raise
+            return self._replies.refuse(query, failed)
+        return self._replies.answer(query, {accepted.key: (_ANSWER, answer)})
 
     async def _serve_put(self, accepted: _Accepted) -> None:
         try:
             await self._send(accepted.robot, accepted.command, accepted.request)
         except CallError as error:
-            self._refused_put(self._keys.call(accepted.robot, accepted.command), error)
+            self._refused_put(accepted.key, error)
         except Exception:
             logger.exception("a put to %s %s failed inside the broker", accepted.robot, accepted.command)
+        finally:
+            self._room.release()
 
     def _refused_put(self, key: str, error: CallError) -> None:
         self.refused_puts += 1
@@ -182,25 +189,6 @@ def read_request(payload: bytes) -> CallRequest:
     if any(isinstance(value, float) and not math.isfinite(value) for value in request.parameters):
         raise CallError("bad_request", "parameters: a number must be finite")
     return request
-
-
-def refuse(query: zenoh.Query, error: CallError) -> None:
-    """End `query` with an error reply; may wait for a slow asker."""
-    with query:
-        refusal = Refusal(error=error.code, message=str(error))
-        _unless_closed(query.reply_err, refusal.model_dump_json(), encoding=_REFUSAL)
-
-
-def _answer(query: zenoh.Query, answer: Answer) -> None:
-    with query:
-        _unless_closed(query.reply, query.key_expr, answer.model_dump_json(), encoding=_ANSWER)
-
-
-def _unless_closed(reply: Callable[..., None], *arguments: object, encoding: zenoh.Encoding) -> None:
-    try:
-        reply(*arguments, encoding=encoding)
-    except zenoh.ZError as error:
-        logger.debug("a reply found no asker: %s", plain(error))
 
 
 def _refuse_parameters(parameters: zenoh.Parameters) -> None:

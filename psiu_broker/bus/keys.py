@@ -76,6 +76,13 @@ class Keys:
     def card(self, robot: Address) -> str:
         return self._join(robot_chunk(robot))
 
+    def read_card(self, key: str) -> Address:
+        """The robot; raises ValueError for any other key."""
+        chunks = self._split(key)
+        if len(chunks) != 1:
+            raise ValueError(f"{key} is not the key of a card")
+        return robot(chunks[0])
+
     def call(self, robot: Address, command: str) -> str:
         return self._join("@call", robot_chunk(robot), chunk(command))
 
@@ -85,6 +92,10 @@ class Keys:
         if len(chunks) != 3 or chunks[0] != "@call" or "*" in key:
             raise ValueError("a call names one robot and one command")
         return robot(chunks[1]), text(chunks[2])
+
+    def alive(self, broker: str) -> str:
+        """What a broker asks only itself."""
+        return self._join("@alive", chunk(broker))
 
     def raw(self, broker: str, link: str) -> str:
         return self._join("@raw", chunk(broker), chunk(link))

@@ -1,6 +1,5 @@
 """What robots say, told to the programs that listen; nothing is decoded for nobody."""
 
-import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -10,7 +9,7 @@ from typing import Any, Final
 import zenoh
 
 from psiu_broker.bus.keys import Keys
-from psiu_broker.bus.session import Session, json_of
+from psiu_broker.bus.session import Session, aside, json_of
 from psiu_broker.errors import BusError
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.messages import Card, Decoded, RawFrame
@@ -22,6 +21,9 @@ logger = logging.getLogger(__name__)
 
 KEYS_MAX: Final = 1024
 """How many keys stay declared; declaring one anew costs about ten puts."""
+
+PRIORITY: Final = zenoh.Priority.DATA_LOW
+"""Not that of replies: a put waits while a reply of its own priority waits for room to the same program."""
 
 _DECODED: Final = json_of("Decoded")
 _RAW: Final = json_of("RawFrame")
@@ -96,7 +98,11 @@ class Publisher:
             if self._cards.get(robot) == payload:
                 return
             self._session.zenoh.put(
-                self._keys.card(robot), payload, encoding=_CARD, congestion_control=zenoh.CongestionControl.DROP
+                self._keys.card(robot),
+                payload,
+                encoding=_CARD,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=PRIORITY,
             )
             self._cards[robot] = payload
             self.puts += 1
@@ -107,7 +113,9 @@ class Publisher:
         """Delete the card of a robot that is gone."""
         try:
             if self._cards.pop(robot, None) is not None:
-                self._session.zenoh.delete(self._keys.card(robot), congestion_control=zenoh.CongestionControl.DROP)
+                self._session.zenoh.delete(
+                    self._keys.card(robot), congestion_control=zenoh.CongestionControl.DROP, priority=PRIORITY
+                )
                 self.puts += 1
         except BaseException as error:
             self._failed(error)
@@ -139,7 +147,7 @@ class Publisher:
                 setattr(self, flag, False)
 
         try:
-            gate, listener = await asyncio.to_thread(declare)
+            gate, listener = await aside(declare)
             look(None)
         except zenoh.ZError as error:
             raise BusError(f"zenoh: {error}") from error
@@ -158,6 +166,7 @@ class Publisher:
             key,
             encoding=encoding,
             congestion_control=zenoh.CongestionControl.DROP,
+            priority=PRIORITY,
             allowed_destination=zenoh.Locality.REMOTE,
         )
 

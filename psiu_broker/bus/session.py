@@ -6,13 +6,13 @@ import json
 import logging
 import re
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Final, Protocol, TypeVar
 
 import zenoh
 
-from psiu_broker.bus.bridge import Bridge
+from psiu_broker.bus.bridge import TURN_MAX, Bridge
 from psiu_broker.errors import BusError
 
 T = TypeVar("T")
@@ -25,6 +25,9 @@ _SOURCE_PLACE: Final = re.compile(r"\s*at /[^\s\]]+\.rs:\d+\.?")
 _BUSY: Final = re.compile(r"bound to (?P<endpoint>\S+): .*(?:already in use|os error 98)", re.DOTALL)
 _THREAD_END_S: Final = 5.0
 
+STUCK_S: Final = 1.0
+"""How long a reply waits for a program that does not read; then Zenoh closes the link to it."""
+
 JSON: Final = zenoh.Encoding.APPLICATION_JSON
 
 
@@ -36,6 +39,15 @@ def json_of(name: str) -> zenoh.Encoding:
 def plain(error: BaseException) -> str:
     """Zenoh's words without the places in its source code."""
     return _SOURCE_PLACE.sub("", str(error)).strip()
+
+
+async def aside(work: Callable[..., Result], *arguments: object) -> Result:
+    """Run `work` in a thread of its own: asyncio's may all be waiting, for a name server or a serial port."""
+    thread = ThreadPoolExecutor(1, "psiu-bus")
+    try:
+        return await asyncio.get_running_loop().run_in_executor(thread, work, *arguments)
+    finally:
+        thread.shutdown(wait=False)
 
 
 class Declared(Protocol):
@@ -58,8 +70,7 @@ class Session:
         self.is_lost = False
         self._lost = lost
         self._loop = asyncio.get_running_loop()
-        # A reply to a stopped client waits up to five seconds for room: never on the loop.
-        self._workers = ThreadPoolExecutor(4, "psiu-bus-reply")
+        self._workers: list[Executor] = []
         self._declared: list[Declared] = []
         self._bridges: list[Bridge[Any, Any]] = []
         # Our reader threads must be out of Zenoh before the interpreter goes, also after an error.
@@ -69,18 +80,17 @@ class Session:
     async def open(
         cls,
         listen: Sequence[str],
-        connect: Sequence[str] = (),
         *,
         lost: Callable[[BusError], None] = lambda error: None,
     ) -> "Session":
-        """Listen at `listen` and keep trying to reach `connect`.
+        """Listen at `listen`.
 
         Raises:
             BusError: an endpoint is taken, impossible or misspelt.
         """
         try:
-            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect)))
-            session = await asyncio.to_thread(zenoh.open, config)
+            config = zenoh.Config.from_json5(json.dumps(_configuration(listen)))
+            session = await aside(zenoh.open, config)
         except Exception as error:
             raise BusError(_open_problem(error)) from error
         except BaseException as error:
@@ -94,16 +104,23 @@ class Session:
         self._declared.append(what)
 
     def bridge(
-        self, source: Iterable[T], sift: Callable[[T], Kept | None], handle: Callable[[Kept], None], *, name: str
-    ) -> Bridge[T, Kept]:
+        self,
+        source: Iterable[T],
+        sift: Callable[[T], Kept | None],
+        handle: Callable[[Kept], None],
+        *,
+        name: str,
+        turn_max: int = TURN_MAX,
+    ) -> None:
         """A `Bridge` whose thread `close` waits for."""
-        bridge = Bridge(source, sift, handle, name=name, failed=self._reader_failed)
-        self._bridges.append(bridge)
-        return bridge
+        failed = self._reader_failed
+        self._bridges.append(Bridge(source, sift, handle, name=name, failed=failed, turn_max=turn_max))
 
-    def off_loop(self, work: Callable[..., Result], *arguments: object) -> "asyncio.Future[Result]":
-        """Run what may wait for a slow program, such as a reply, in a worker thread."""
-        return self._loop.run_in_executor(self._workers, work, *arguments)
+    def worker(self, name: str) -> Executor:
+        """A thread, begun when needed, for what may wait for a program; `close` ends it."""
+        worker = ThreadPoolExecutor(1, f"psiu-{name}")
+        self._workers.append(worker)
+        return worker
 
     def panicked(self, error: BaseException) -> bool:
         """True if `error` is a panic inside Zenoh: the session is given up and `lost` is told. Any thread."""
@@ -118,7 +135,7 @@ class Session:
 
     async def close(self) -> None:
         """Undeclare and close everything and wait for the threads; harmless twice, never raises."""
-        await asyncio.to_thread(self._close)
+        await aside(self._close)
 
     def _close(self) -> None:
         atexit.unregister(self._close)
@@ -136,7 +153,8 @@ class Session:
         for bridge in self._bridges:
             bridge.join(_THREAD_END_S)
         self._bridges.clear()
-        self._workers.shutdown(wait=True)
+        for worker in self._workers:
+            worker.shutdown(wait=True)
 
     def _reader_failed(self, error: BaseException) -> None:
         if not self.panicked(error):
@@ -148,20 +166,20 @@ def _is_panic(error: BaseException) -> bool:
     return type(error).__name__ == "PanicException"
 
 
-def _configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, object]:
+def _configuration(listen: Sequence[str]) -> dict[str, object]:
     return {
         "mode": "peer",
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
-        "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": -1,  # 0 would never try again
-            "exit_on_failure": False,
-            "retry": {"period_init_ms": 250, "period_max_ms": 4000, "period_increase_factor": 2},
-        },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {"tx": {"lease": 2000, "keep_alive": 4}},
+            "link": {
+                "tx": {
+                    "lease": 2000,
+                    "keep_alive": 4,
+                    "queue": {"congestion_control": {"block": {"wait_before_close": int(STUCK_S * 1e6)}}},
+                },
+            },
         },
     }
 

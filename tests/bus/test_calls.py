@@ -4,8 +4,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import Future
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -46,7 +49,7 @@ class Robots:
         self.sent.append((robot, command, request))
         if command == "bug":
             raise ZeroDivisionError
-        if command == "refused":
+        if command == "refused" or len(command) > 100:
             raise CallError("refused", "parafrente takes 0–999, got 1200")
 
 
@@ -124,6 +127,7 @@ async def test_a_bug_in_the_broker_is_an_answer_and_a_log_entry(
         b'{"parameters": 5}',
         b'{"parameters": [[1]]}',
         b'{"parameters": [NaN]}',
+        b'{"parameters": [true]}',
         b'{"parameters": [1e999]}',
         b'{"timeout_s": 0}',
         b'{"timeout_s": 1e9}',
@@ -217,8 +221,9 @@ async def test_a_put_that_fails_troubles_nobody(
     program.delete("psiu/@call/A/deleted")
     for command in ("refused", "bug", "fine"):
         program.put(f"psiu/@call/A/{command}", b"")
-    await until(lambda: len(robots.sent) == 3)
-    assert calls.refused_puts == 1
+    program.put("psiu/@call/A/" + "é" * 8000, b"")  # its key would be too long as we write it
+    await until(lambda: len(robots.sent) == 4)
+    assert calls.refused_puts == 2
     assert [record.levelname for record in caplog.records if record.levelname == "ERROR"] == ["ERROR"]
 
 
@@ -251,6 +256,38 @@ async def test_a_broker_that_stops_says_so_to_everybody_who_waits(
         assert refusal.error == "shutting_down"
 
 
+async def test_a_broker_that_stops_says_so_to_those_who_come_then(
+    calls: Calls, program: zenoh.Session, robots: Robots, until: Until
+) -> None:
+    robots.hold.clear()
+    earlier = asyncio.create_task(ask(program, "psiu/@call/A/earlier"))
+    await until(lambda: robots.called)
+    asked: Any = SimpleNamespace(query=object())
+    told: list[str] = []
+    calls._replies.refuse = lambda query, error: told.append(error.code) or Future()  # type: ignore[method-assign]
+    calls._begin(asked)  # not even begun when the broker stops
+    await calls.close()
+    calls._begin(asked)
+    await until(lambda: len(told) == 3)
+    assert told == ["shutting_down"] * 3
+    earlier.cancel()
+
+
+async def test_an_answer_on_its_way_is_not_lost_when_the_broker_stops(
+    calls: Calls, program: zenoh.Session, robots: Robots, until: Until
+) -> None:
+    busy = threading.Event()
+    calls._replies._worker.submit(busy.wait)  # as with an asker that does not read
+    asked = asyncio.create_task(ask(program, "psiu/@call/A/b"))
+    await until(lambda: calls._replies._pending)
+    closing = asyncio.create_task(calls.close())
+    await asyncio.sleep(0.01)
+    busy.set()
+    await closing
+    [answer] = await asked
+    assert answer["status"] == "sucesso"
+
+
 async def test_an_asker_that_gave_up_harms_nobody(
     calls: Calls, program: zenoh.Session, robots: Robots, until: Until
 ) -> None:
@@ -262,8 +299,8 @@ async def test_an_asker_that_gave_up_harms_nobody(
     assert answer["status"] == "sucesso"
 
 
-async def test_an_answer_to_a_stopped_program_does_not_stop_the_loop(
-    calls: Calls, session: Session, program: zenoh.Session, endpoint: str, robots: Robots, until: Until
+async def test_an_answer_to_a_stopped_program_keeps_others_waiting_for_a_moment_only(
+    session: Session, calls: Calls, program: zenoh.Session, endpoint: str, robots: Robots, until: Until
 ) -> None:
     script = f"""
 import json, time, zenoh
@@ -279,15 +316,13 @@ time.sleep(60)
         await until(lambda: robots.called)
         os.kill(stopped.pid, signal.SIGSTOP)
         flood = session.zenoh.declare_publisher("psiu/flood", congestion_control=zenoh.CongestionControl.DROP)
-        for _ in range(20_000):  # its queue and its socket are full now: a reply to it waits five seconds
+        for _ in range(20_000):  # its queue and its socket are full now: a reply to it waits
             flood.put(b"x" * 1000)
         robots.hold.set()
         begun = time.monotonic()
-        [answer] = await ask(program, "psiu/@call/A/b")
-        await asyncio.sleep(0.05)
+        [answer] = await ask(program, "psiu/@call/A/b", timeout_s=10)
         assert answer["status"] == "sucesso"
-        assert time.monotonic() - begun < 2
-        assert calls._tasks  # the answer to the stopped one is still on its way out
+        assert time.monotonic() - begun < 4  # Zenoh's own patience is five seconds
     finally:
         stopped.kill()
         stopped.wait()

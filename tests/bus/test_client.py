@@ -69,7 +69,8 @@ async def broker(session: Session, keys: Keys, sent: list[Any]) -> AsyncIterator
         health=dict,
         config=dict,
         why=lambda a, b: Why(a=str(a), b=str(b), delivered=False, verdict="no_route", steps=[]),
-        cards=lambda: {Address.named(name): card(name) for name in ("PC", "MNERIM")},
+        robots=lambda: [Address.named(name) for name in ("PC", "MNERIM")],
+        card=lambda robot: card(str(robot)),
     )
     await Queries.open(session, keys, "base", source)
     calls = await Calls.open(session, keys, call, send)

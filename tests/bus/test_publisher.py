@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from psiu_broker.bus.keys import Keys
-from psiu_broker.bus.publisher import KEYS_MAX, Publisher
+from psiu_broker.bus.publisher import KEYS_MAX, PRIORITY, Publisher
 from psiu_broker.bus.session import Session
 from psiu_broker.errors import BusError
 from psiu_broker.frame import EVERYONE, NOBODY, Address, Frame, Way
@@ -296,7 +296,7 @@ async def test_a_panic_while_publishing_is_counted_and_ends_the_listening(
     subscribe("psiu/**")
     await until(lambda: publisher.listened)
     with pytest.raises(BaseException, match="DidntWrite"):
-        session.zenoh.put("psiu/x", b"", encoding=zenoh.Encoding("a/b").with_schema("x" * 300))
+        session.zenoh.put("psiu/x", b"", encoding=zenoh.Encoding("a/b").with_schema("x" * 300), priority=PRIORITY)
     publisher.publish(COMMAND, RADIO, time.time())
     assert publisher.failures == 1
     assert publisher.listened is False

@@ -1,6 +1,6 @@
 import asyncio
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,7 +11,6 @@ from psiu_broker.bus import queries as queries_module
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.session import Session
-from psiu_broker.errors import BusError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Account, Card, Health, Ledger, Link, Refusal, Route, Status, Why
 
@@ -19,9 +18,11 @@ NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
 
 class Broker:
-    """A broker with two robots, one of them with an odd name."""
+    """A broker with three robots, one of them with an odd name; remembers whose cards it built."""
 
-    robots = (Address.named("MNERIM"), Address.named("0x12"), Address.numbered(0x12))
+    def __init__(self) -> None:
+        self.known = [Address.named("MNERIM"), Address.named("0x12"), Address.numbered(0x12)]
+        self.built: list[Address] = []
 
     def status(self) -> Status:
         return Status(
@@ -57,16 +58,24 @@ class Broker:
             raise ZeroDivisionError
         return Why(a=str(a), b=str(b), delivered=True, verdict=f"{a!r} {b!r}", steps=[])
 
-    def cards(self) -> Mapping[Address, Card]:
-        return {
-            robot: Card(robot=str(robot), protocol="psiu-ascii", broker="base", link="radio", link_state="open")
-            for robot in self.robots
-        }
+    def robots(self) -> Iterable[Address]:
+        return self.known
+
+    def card(self, robot: Address) -> Card | None:
+        self.built.append(robot)
+        if robot not in self.known:
+            return None
+        return Card(robot=str(robot), protocol="psiu-ascii", broker="base", link="radio", link_state="open")
 
 
 @pytest.fixture
-async def queries(session: Session, keys: Keys) -> Queries:
-    return await Queries.open(session, keys, "base", Broker())
+async def broker() -> Broker:
+    return Broker()
+
+
+@pytest.fixture
+async def queries(session: Session, keys: Keys, broker: Broker) -> Queries:
+    return await Queries.open(session, keys, "base", broker)
 
 
 async def ask(program: zenoh.Session, key: str) -> dict[str, Any]:
@@ -147,10 +156,21 @@ async def test_all_cards_come_each_on_its_own_key(queries: Queries, program: zen
     assert Card.model_validate(found["psiu/MNERIM"]).robot == "MNERIM"
 
 
-async def test_one_card_comes_alone_and_a_stranger_has_none(queries: Queries, program: zenoh.Session) -> None:
+async def test_one_card_comes_alone_and_a_stranger_has_none(
+    queries: Queries, program: zenoh.Session, broker: Broker
+) -> None:
     assert set(await ask(program, "psiu/MNERIM")) == {"psiu/MNERIM"}
+    assert broker.built == [Address.named("MNERIM")]  # and nobody else's
     assert set(await ask(program, "psiu/0x12")) == {"psiu/0x12"}
     assert await ask(program, "psiu/STRANGER") == {}
+    assert await ask(program, "psiu/%ED%A0%80") == {}
+
+
+async def test_only_the_cards_that_a_wildcard_covers_are_built(
+    queries: Queries, program: zenoh.Session, broker: Broker
+) -> None:
+    assert set(await ask(program, "psiu/$*12")) == {"psiu/%30x12", "psiu/0x12"}
+    assert set(broker.built) == {Address.named("0x12"), Address.numbered(0x12)}
 
 
 async def test_many_questions_at_once_all_get_an_answer(
@@ -163,10 +183,3 @@ async def test_many_questions_at_once_all_get_an_answer(
     refusals = [Refusal.model_validate_json(r.err.payload.to_bytes()).error for [r] in replies if r.err]
     assert set(refusals) <= {"busy"}
     assert set(await ask(program, "psiu/@broker/base/status")) == {"psiu/@broker/base/status"}
-
-
-async def test_a_round_trip_goes_through_zenoh_and_the_loop(queries: Queries, session: Session) -> None:
-    assert 0 < await queries.round_trip(2) < 2
-    await session.close()
-    with pytest.raises(BusError):
-        await queries.round_trip(1)

@@ -2,14 +2,20 @@ import asyncio
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, cast
+from unittest.mock import MagicMock
 
 import psutil
 import pytest
 import zenoh
 
+from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.publisher import Publisher
+from psiu_broker.bus.queries import Queries
+from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session
 from psiu_broker.errors import BusError
 
@@ -29,32 +35,40 @@ async def test_an_impossible_endpoint_is_one_line_without_places_in_zenohs_sourc
     assert "\n" not in str(raised.value)
 
 
-async def test_a_broker_that_is_not_there_yet_stops_nobody(endpoint: str) -> None:
-    early = await Session.open([], [endpoint])
-    late = await Session.open([endpoint])
-    met = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    listener = late.zenoh.info.declare_transport_events_listener(
-        lambda event: loop.call_soon_threadsafe(met.set), history=True
-    )
-    await asyncio.wait_for(met.wait(), 10)
-    await asyncio.to_thread(listener.undeclare)
-    await early.close()
-    await late.close()
-
-
-async def test_closing_ends_every_thread_frees_the_port_and_is_harmless_twice(endpoint: str, keys: Keys) -> None:
+async def test_closing_ends_every_thread_frees_the_port_and_is_harmless_twice(
+    endpoint: str, keys: Keys, until: Callable[[Callable[[], object]], Awaitable[None]]
+) -> None:
     before = set(threading.enumerate())
     for _ in range(3):
         session = await Session.open([endpoint])
         await Publisher.open(session, keys, "base", lambda frame: {})
-        await session.off_loop(lambda: None)
+        await asyncio.wrap_future(session.worker("bus-test").submit(lambda: None))
         assert any(thread.name.startswith("psiu-bus") for thread in threading.enumerate())
         await session.close()
         await session.close()
-    ended = [thread.name for thread in set(threading.enumerate()) - before if thread.name.startswith("psiu")]
-    assert ended == []
+    await until(lambda: not any(thread.name.startswith("psiu") for thread in set(threading.enumerate()) - before))
     assert not [c for c in psutil.Process().net_connections() if c.laddr and str(c.laddr.port) in endpoint]
+
+
+async def test_the_bus_works_while_every_thread_of_asyncio_waits(endpoint: str, keys: Keys) -> None:
+    async def unused(*_: object) -> None: ...
+
+    freed = threading.Event()
+    with ThreadPoolExecutor(1) as taken:
+        asyncio.get_running_loop().set_default_executor(taken)
+        waiting = asyncio.get_running_loop().run_in_executor(None, freed.wait)
+        try:
+            async with asyncio.timeout(20):
+                session = await Session.open([endpoint])
+                await Publisher.open(session, keys, "base", lambda frame: {})
+                await Calls.open(session, keys, cast("Any", unused), unused)
+                await Queries.open(session, keys, "base", MagicMock())
+                trip = await RoundTrip.open(session, keys, "base")
+                assert await trip.measure(10) < 10
+                await session.close()
+        finally:
+            freed.set()
+            await waiting
 
 
 async def test_a_panic_inside_zenoh_loses_the_session_and_another_opens_in_its_place(
@@ -96,7 +110,7 @@ from psiu_broker.bus.session import Session
 async def main():
     session = await Session.open([{endpoint!r}])
     await Publisher.open(session, Keys(), "base", lambda frame: {{}})
-    await session.off_loop(lambda: None)
+    await asyncio.wrap_future(session.worker("bus-test").submit(lambda: None))
     {end}
 asyncio.run(main())
 """
