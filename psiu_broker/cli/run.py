@@ -57,6 +57,10 @@ def run(file: Path, verbose: bool, quiet: bool) -> None:
         asyncio.run(_serve(configuration))
     except BusError as error:
         raise Failure(str(error)) from error
+    # All is closed. A thread that still waits for a driver, and then meets an object of Zenoh while the interpreter
+    # goes, would have the process aborted.
+    logging.shutdown()
+    os._exit(0)
 
 
 async def _serve(configuration: Configuration) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,13 +15,20 @@ from psiu_broker.messages import Card, Decoded, RawFrame
 Start = Callable[..., Any]
 
 
+def patiently() -> Iterator[None]:
+    """Again and again, but not for ever."""
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        yield
+
+
 @pytest.fixture
 def watch(lab: Any, start: Start) -> Callable[..., Any]:
     @contextmanager
     def watching(*words: str, sign: str, robot: str = "MNERIM", command: str = "distancia") -> Iterator[Any]:
         """`psiu monitor`, once it has seen a call: nobody is told when it begins to listen."""
         monitor = start("psiu", "monitor", *words, env=lab.env)
-        for _ in range(100):
+        for _ in patiently():
             lab.run("call", robot, command)
             if any(sign in line for line in tuple(monitor.out)):
                 break
@@ -94,7 +102,7 @@ def test_a_closed_pipe_ends_it_quietly(lab: Any, start: Start) -> None:
     monitor = start("psiu", "monitor", env=lab.env, stdout=writing)
     os.close(reading)
     os.close(writing)
-    for _ in range(100):
+    for _ in patiently():
         lab.run("call", "MNERIM", "distancia")
         if monitor.popen.poll() is not None:
             break
