@@ -5,6 +5,7 @@ import errno
 import os
 from collections.abc import Callable, Collection
 
+from psiu_adapters.aside import Aside
 from psiu_broker.adapter import Peer, Receiver, Transport
 from psiu_broker.errors import LinkError, LinkLost
 
@@ -108,7 +109,7 @@ class DescriptorTransport(Transport):
         finally:
             self._stop()
             # In a thread: the kernel may wait for a modem that holds its flow control.
-            await asyncio.to_thread(self._close)
+            await Aside(f"{self._name} closes").run(self._close)
 
     async def _drain(self) -> None:
         """Let the frames that were taken leave whole, within a limit; nothing is received any more."""

@@ -12,6 +12,7 @@ import termios
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,8 @@ import serial
 from pydantic import Field
 from serial.tools import list_ports
 
-from psiu_adapters.descriptor import DescriptorTransport
+from psiu_adapters.aside import Aside
+from psiu_adapters.descriptor import BITS_A_BYTE, DescriptorTransport
 from psiu_adapters.hotplug import tty_events
 from psiu_adapters.serial_faults import explain, holders, refused_baudrate
 from psiu_adapters.serial_pump import READ_TIMEOUT_S, Pump, close_port
@@ -69,22 +71,24 @@ class Serial(Adapter):
 
     @property
     def bits_per_second(self) -> int | None:
-        return self.baudrate if self.pace and self.scheme not in {"socket", "loop"} else None
+        """The line rate as if a character had ten bits, as 8N1 has: 9600 baud with 8E2 carry what 8000 would."""
+        if not self.pace or self.scheme in {"socket", "loop"}:
+            return None
+        character_bits = 1 + self.bytesize + (self.parity != "none") + self.stopbits
+        return max(1, self.baudrate * BITS_A_BYTE // character_bits)
 
     async def open(self, receiver: Receiver) -> Transport:
-        opening = asyncio.ensure_future(asyncio.to_thread(self._open_port))
-        try:
-            port, facts = await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            # The thread cannot be stopped; what it opens belongs to nobody any more.
-            opening.add_done_callback(_close_abandoned)
-            raise
+        port, facts = await self._aside.run(self._open_port, unwanted=lambda opened: close_port(opened[0]))
         try:
             await asyncio.sleep(self.open_delay_s)
             return _SerialTransport(self, port, facts, receiver)
         except BaseException:
-            await asyncio.to_thread(close_port, port)
+            await self._aside.run(lambda: close_port(port))
             raise
+
+    @cached_property
+    def _aside(self) -> Aside:
+        return Aside(f"{self.device} opens")
 
     async def changed(self) -> None:
         if self.scheme:
@@ -96,8 +100,9 @@ class Serial(Adapter):
             nodes.add(node)
             event.set()
 
-        with tty_events(appeared):
-            before = self._seen()
+        # Before udev's help is there, which may take a while: what changes meanwhile counts.
+        before = self._seen()
+        async with tty_events(appeared):
             while True:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(POLL_S):
@@ -277,8 +282,3 @@ def _facts(device: str, path: str) -> Facts:
             str(stable) if stable else "its name below /dev/serial/by-id/"
         )
     return facts
-
-
-def _close_abandoned(opening: "asyncio.Future[tuple[serial.Serial, Facts]]") -> None:
-    if not opening.cancelled() and opening.exception() is None:
-        asyncio.get_running_loop().run_in_executor(None, close_port, opening.result()[0])

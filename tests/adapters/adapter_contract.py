@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import os
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
@@ -234,6 +235,7 @@ class AdapterContract:
 
     async def test_waiting_for_a_change_leaves_nothing_when_it_is_cancelled(self, far: FarEnd) -> None:
         await self._wait_a_little(far)
+        gc.collect()
         before = open_descriptors()
         await self._wait_a_little(far)
         gc.collect()
@@ -269,7 +271,9 @@ def open_descriptors() -> set[str]:
 
 
 async def descriptors_become(expected: set[str]) -> None:
-    """Wait until exactly `expected` are open: a thread may still be closing what was abandoned."""
+    """Wait until exactly `expected` are open and no thread is left that may still open or close what was abandoned."""
     async with asyncio.timeout(PATIENCE_S):
-        while open_descriptors() != expected:  # noqa: ASYNC110 — the thread tells nobody
+        while (  # noqa: ASYNC110 — the thread tells nobody
+            open_descriptors() != expected or any(thread.daemon for thread in threading.enumerate())
+        ):
             await asyncio.sleep(0.01)

@@ -1,0 +1,50 @@
+"""Blocking calls that may hang (a name server that is silent, a driver that is stuck) and must hold up nothing else."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class Aside:
+    """Blocking work, one piece at a time, each in a daemon thread.
+
+    The event loop's own executor is shared with everything, and the end of the process waits for
+    its threads; for these nothing waits.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._last: Future[Any] | None = None
+
+    async def run(self, work: Callable[[], T], unwanted: Callable[[T], object] = lambda _: None) -> T:
+        """What `work` returns or raises; `unwanted` takes what it returns after a cancellation, in its thread.
+
+        Waits first for work that was begun before and is still under way, cancelled or not.
+        """
+        while self._last is not None and not self._last.done():
+            with suppress(Exception):  # it has been told to whom it concerns
+                await asyncio.wrap_future(self._last)
+        begun: Future[T] = Future()
+        # From now on a cancellation reaches the waiting only, not the work.
+        begun.set_running_or_notify_cancel()
+        self._last = begun
+        threading.Thread(target=_carry_out, args=(work, begun), name=self._name, daemon=True).start()
+        try:
+            return await asyncio.wrap_future(begun)
+        except asyncio.CancelledError:
+            begun.add_done_callback(lambda ended: None if ended.exception() else unwanted(ended.result()))
+            raise
+
+
+def _carry_out(work: Callable[[], T], begun: "Future[T]") -> None:
+    try:
+        result = work()
+    except BaseException as error:  # all of it is for whoever waits
+        begun.set_exception(error)
+    else:
+        begun.set_result(result)
