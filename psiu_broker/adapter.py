@@ -85,6 +85,19 @@ class Adapter(BaseModel, ABC):
         await asyncio.Event().wait()
 
     @property
+    def many_peers(self) -> bool:
+        """Whether there may be more than one peer at a time; default: no."""
+        return False
+
+    def peer_named(self, text: str) -> Peer:
+        """Whom ``peer = text`` of a robot means.
+
+        Raises:
+            ValueError: nobody; the text says what to write instead. Default: always.
+        """
+        raise ValueError("is for links with several far ends, and this one has a single one; remove it")
+
+    @property
     def bits_per_second(self) -> int | None:
         """What the line carries, ten bits a byte; None where it does not limit us."""
         return None

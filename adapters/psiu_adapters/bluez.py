@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import os
 import socket
+from collections import defaultdict
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -50,11 +51,11 @@ class Bluez:
         self.bus = SystemBus(self._asked, self._gone)
         self._registering = asyncio.Lock()
         self._registered = False
-        # A controller can search for or call one device at a time.
-        self._radio = asyncio.Lock()
+        # A controller can search or pair for one of us at a time; calls it queues by itself.
+        self._searching: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._expected: dict[str, asyncio.Future[int]] = {}
         self._connections: dict[str, int] = {}
-        self._acceptor: Acceptor | None = None
+        self._acceptors: dict[str, Acceptor] = {}
         self._agent_users = 0
         self._pins: dict[str, str] = {}
 
@@ -75,11 +76,12 @@ class Bluez:
         self._expected[address] = arrived
         try:
             await self._register()
-            async with self._radio:
-                path, paired = await self._find(address, controller, discovery_s)
-                if not paired:
-                    await self._pair(path, address, pin, timeout_s)
-                await self._connect_profile(path, arrived, timeout_s)
+            path = device_path(controller, address)
+            if not await self._is_paired(path, controller):
+                async with self._searching[controller]:
+                    if not await self._find(path, address, controller, discovery_s):
+                        await self._pair(path, address, pin, timeout_s)
+            await self._connect_profile(path, arrived, timeout_s)
             fd = arrived.result()
         except BaseException as error:
             if arrived.done() and arrived.exception() is None:
@@ -101,18 +103,18 @@ class Bluez:
         """
         try:
             await self._register()
-            _powered(await self._objects(), controller)
+            _check_powered(await self._objects(), controller)
             await self._agent_up()
         except Refused as refused:
             raise explained(refused, controller) from refused
-        if self._acceptor is not None:
+        if controller in self._acceptors:
             self._agent_down()
-            raise LinkBusy("another link of this broker accepts Bluetooth connections: keep one of them")
-        self._acceptor = acceptor
+            raise LinkBusy(f"another link of this broker accepts connections on {controller}: keep one of them")
+        self._acceptors[controller] = acceptor
 
-    def stop_accepting(self) -> None:
+    def stop_accepting(self, controller: str) -> None:
         """The opposite of a successful `accept`."""
-        self._acceptor = None
+        del self._acceptors[controller]
         self._agent_down()
 
     def keep(self, address: str, fd: int) -> None:
@@ -147,8 +149,8 @@ class Bluez:
             if not arrived.done():
                 arrived.set_exception(LinkLost(why))
                 arrived.exception()
-        if self._acceptor is not None:
-            self._acceptor.lost(LinkLost(why))
+        for acceptor in tuple(self._acceptors.values()):
+            acceptor.lost(LinkLost(why))
 
     async def _register(self) -> None:
         async with self._registering:
@@ -169,17 +171,22 @@ class Bluez:
         (objects,) = await self.bus.call("/", OBJECT_MANAGER, "GetManagedObjects")
         return objects
 
-    async def _find(self, address: str, controller: str, discovery_s: float) -> tuple[str, bool]:
-        """The device's path and whether it is paired; searched for if BlueZ does not know it."""
-        path = device_path(controller, address)
+    async def _is_paired(self, path: str, controller: str) -> bool | None:
+        """Whether the device of `path` is paired; None if BlueZ does not know it."""
         objects = await self._objects()
-        controller_path = _powered(objects, controller)
-        if DEVICE not in objects.get(path, {}):
-            await self._discover(controller_path, path, discovery_s)
-            objects = await self._objects()
-        if DEVICE not in objects.get(path, {}):
+        _check_powered(objects, controller)
+        device = objects.get(path, {}).get(DEVICE)
+        return None if device is None else _value(device, "Paired") is True
+
+    async def _find(self, path: str, address: str, controller: str, discovery_s: float) -> bool:
+        """Whether the device is paired; searched for if BlueZ does not know it."""
+        paired = await self._is_paired(path, controller)
+        if paired is None:
+            await self._discover(f"{MANAGER_PATH}/{controller}", path, discovery_s)
+            paired = await self._is_paired(path, controller)
+        if paired is None:
             raise LinkAbsent(f"{address} is not in reach: switch it on (searched for {discovery_s:g} s)")
-        return path, _value(objects[path][DEVICE], "Paired") is True
+        return paired
 
     async def _discover(self, controller_path: str, path: str, discovery_s: float) -> None:
         """Return when BlueZ knows the device of `path`, or when the time is over."""
@@ -278,19 +285,23 @@ class Bluez:
             return Message.new_method_return(message)
         address = _address(message.body[0])
         if message.member == "NewConnection":
-            return self._new_connection(message, address)
+            return self._new_connection(message, address, self._acceptor(message.body[0]))
         if message.member == "RequestDisconnection" and address in self._connections:
             hang_up(os.dup(self._connections[address]))
         return Message.new_method_return(message)
 
-    def _new_connection(self, message: Message, address: str) -> Message:
+    def _acceptor(self, path: str) -> Acceptor | None:
+        """Who accepts what the device of `path` calls."""
+        return self._acceptors.get(path.removeprefix(f"{MANAGER_PATH}/").partition("/")[0])
+
+    def _new_connection(self, message: Message, address: str, acceptor: Acceptor | None) -> Message:
         fd = message.unix_fds[message.body[1]]
         os.set_inheritable(fd, False)
         arrived = self._expected.get(address)
         if arrived is not None and not arrived.done():
             arrived.set_result(fd)
-        elif self._acceptor is not None:
-            self._acceptor.connected(address, fd)
+        elif acceptor is not None:
+            acceptor.connected(address, fd)
         else:
             hang_up(fd)
             return Message.new_error(message, REJECTED, "no link of the broker waits for this device")
@@ -302,7 +313,9 @@ class Bluez:
             return Message.new_method_return(message)
         pin = self._pins.get(_address(message.body[0]))
         if message.member == "AuthorizeService":
-            if message.body[1].lower() == SERIAL_PORT and (self._acceptor is not None or pin is not None):
+            if message.body[1].lower() == SERIAL_PORT and (
+                self._acceptor(message.body[0]) is not None or pin is not None
+            ):
                 return Message.new_method_return(message)
         elif pin is not None:
             if message.member == "RequestPinCode":
@@ -329,16 +342,14 @@ def _address(path: str) -> str:
     return path.rpartition("/dev_")[2].replace("_", ":")
 
 
-def _powered(objects: Objects, controller: str) -> str:
-    """The path of `controller`, which must be there and switched on."""
-    path = f"{MANAGER_PATH}/{controller}"
-    interfaces = objects.get(path, {})
+def _check_powered(objects: Objects, controller: str) -> None:
+    """Raises LinkAbsent unless `controller` is there and switched on."""
+    interfaces = objects.get(f"{MANAGER_PATH}/{controller}", {})
     if ADAPTER not in interfaces:
         there = ", ".join(sorted(p.rpartition("/")[2] for p, i in objects.items() if ADAPTER in i)) or "none"
         raise LinkAbsent(f"no Bluetooth controller {controller}: plug it in, or name another (there: {there})")
     if _value(interfaces[ADAPTER], "Powered") is not True:
         raise LinkAbsent(f"Bluetooth controller {controller} is switched off: bluetoothctl power on")
-    return path
 
 
 def _value(properties: dict[str, Variant], name: str) -> Any:

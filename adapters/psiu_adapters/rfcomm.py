@@ -50,6 +50,13 @@ class Rfcomm(Adapter):
             raise ValueError('channel is for calling by route = "socket": BlueZ looks it up, leave one of them out')
         return self
 
+    @property
+    def many_peers(self) -> bool:
+        return self.accept
+
+    def peer_named(self, text: str) -> Peer:
+        return _bluetooth_address(text) if self.accept else super().peer_named(text)
+
     async def open(self, receiver: Receiver) -> Transport:
         if self.address is None:
             return await self._accept(receiver)
@@ -170,7 +177,7 @@ class Accepting(Transport):
         if not self._open:
             return
         self._open = False
-        self._bluez.stop_accepting()
+        self._bluez.stop_accepting(self._controller)
         try:
             for address in list(self._callers):
                 self._drop(address)
@@ -187,8 +194,16 @@ class Accepting(Transport):
         if address in self._callers:
             self._caller_lost(address)
         self._bluez.keep(address, fd)
-        one = _One(self._receiver, address, self._caller_lost)
-        self._callers[address] = DescriptorTransport(fd, one, peer=address, close=lambda: hang_up(fd), name=address)
+
+        def lost() -> None:
+            # Said a turn late: by now the device may have called again, or the link be closed.
+            if self._callers.get(address) is caller:
+                self._caller_lost(address)
+
+        caller = DescriptorTransport(
+            fd, _One(self._receiver, lost), peer=address, close=lambda: hang_up(fd), name=address
+        )
+        self._callers[address] = caller
 
     def stopped(self, error: LinkError) -> None:
         """BlueZ has gone, so nobody can call any more."""
@@ -211,12 +226,11 @@ class Accepting(Transport):
 class _One:
     """The receiver of one caller: its loss is not the link's."""
 
-    def __init__(self, receiver: Receiver, address: str, lost: Callable[[str], None]) -> None:
+    def __init__(self, receiver: Receiver, lost: Callable[[], None]) -> None:
         self.received = receiver.received
         self.writable = receiver.writable
         self.peer_lost = receiver.peer_lost
-        self._address = address
         self._lost = lost
 
     def lost(self, _error: LinkError, /) -> None:
-        self._lost(self._address)
+        self._lost()

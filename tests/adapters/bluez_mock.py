@@ -1,9 +1,10 @@
 # ruff: noqa: N802
-"""A dbusmock template: bluetoothd with a controller hci0, for the system's Python.
+"""A dbusmock template: bluetoothd with a controller hci0, or with `controllers`, for the system's Python.
 
 A robot is switched on when a Unix socket listens in the directory `robots` under its address
-(underscores for colons). Parameters: robots, powered, known = {address: {"paired": bool, "pin": str}},
-hidden = the same, found by an inquiry. Interface org.psiu.Mock steers it.
+(underscores for colons). Parameters: robots, powered, known = {address: {"paired": bool, "pin": str,
+"controller": str}}, hidden = the same, found by an inquiry. ConnectProfile to a robot that is off
+fails at once, or with the PIN "silent" never answers. Interface org.psiu.Mock steers it.
 """
 
 import socket
@@ -25,6 +26,8 @@ STEER = "org.psiu.Mock"
 CONTROLLER = "/org/bluez/hci0"
 
 state = {"log": [], "profile": None, "agents": {}, "default": None, "robots": "", "hidden": {}, "pins": {}, "calls": {}}
+state["behind"] = {}
+state["waiting"] = []
 
 
 def failure(name, text):
@@ -32,7 +35,7 @@ def failure(name, text):
 
 
 def path_of(address):
-    return CONTROLLER + "/dev_" + address.replace(":", "_")
+    return "/org/bluez/" + state["behind"].get(address, "hci0") + "/dev_" + address.replace(":", "_")
 
 
 def load(mock, parameters):
@@ -40,14 +43,16 @@ def load(mock, parameters):
     state["robots"] = parameters["robots"]
     state["hidden"] = dict(parameters.get("hidden", {}))
     mock.AddObject("/org/bluez", "org.bluez.ProfileManager1", {}, [])
-    if parameters.get("controller", True):
-        mock.AddObject(CONTROLLER, ADAPTER, {"Powered": dbus.Boolean(parameters.get("powered", True))}, [])
+    for controller in parameters.get("controllers", ["hci0"]):
+        powered = {"Powered": dbus.Boolean(parameters.get("powered", True))}
+        mock.AddObject("/org/bluez/" + controller, ADAPTER, powered, [])
     for address, device in parameters.get("known", {}).items():
         add_device(address, device)
 
 
 def add_device(address, device):
     root = state["root"]
+    state["behind"][address] = device.get("controller", "hci0")
     properties = {"Address": dbus.String(address), "Paired": dbus.Boolean(device.get("paired", False))}
     properties["ServicesResolved"] = dbus.Boolean(False)
     state["pins"][path_of(address)] = device.get("pin", "1234")
@@ -195,6 +200,9 @@ def ConnectProfile(self, uuid, done=None, failed=None):
         state["pins"][self.path] = ""
         GLib.timeout_add(50, lambda: self.UpdateProperties(DEVICE, {"ServicesResolved": dbus.Boolean(True)}))
         raise failure("InProgress", "Operation already in progress")
+    if state["pins"][self.path] == "silent" and not Path(socket_of(self.path)).exists():
+        state["waiting"].append((done, failed))
+        return
     new_connection(self.path, done, failed)
 
 

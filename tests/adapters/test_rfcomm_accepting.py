@@ -100,8 +100,28 @@ async def test_bluetoothd_stopping_is_told_to_a_link_that_accepts(bluetooth: Blu
 async def test_only_one_link_accepts(bluetooth: Bluetooth) -> None:
     await bluetooth.start()
     async with opened(Rfcomm(accept=True), Recorder()):
-        with pytest.raises(LinkBusy, match="another link of this broker accepts"):
+        with pytest.raises(LinkBusy, match="another link of this broker accepts connections on hci0"):
             await Rfcomm(accept=True).open(Recorder())
+
+
+async def test_each_controller_has_its_own_link_that_accepts(bluetooth: Bluetooth) -> None:
+    await bluetooth.start(controllers=["hci0", "hci1"], known={ROBOT: {}, OTHER: {"controller": "hci1"}})
+    first, second = Recorder(), Recorder()
+    async with (
+        bluetooth.robot(ROBOT) as one,
+        bluetooth.robot(OTHER) as other,
+        opened(Rfcomm(accept=True), first),
+        opened(Rfcomm(accept=True, controller="hci1"), second) as closing,
+    ):
+        for address, phone in ((ROBOT, one), (OTHER, other)):
+            assert await bluetooth.steer("Call", "sb", address, False) == "connected"
+            (await phone.joined())[1].write(address.encode())
+        await first.until(lambda: first.heard)
+        await second.until(lambda: second.heard)
+        assert (first.heard, second.heard) == ([(ROBOT.encode(), ROBOT)], [(OTHER.encode(), OTHER)])
+        await closing.close()
+        assert await bluetooth.steer("Call", "sb", OTHER, True) == "rejected"
+        assert await bluetooth.steer("Call", "sb", ROBOT, True) == "connected"
 
 
 class Caller(FarEnd):
@@ -148,5 +168,5 @@ class TestContract(AdapterContract):
 
     @pytest.fixture
     async def absent(self, bluetooth: Bluetooth) -> Adapter:
-        await bluetooth.start(controller=False)
+        await bluetooth.start(controllers=[])
         return Rfcomm(accept=True)

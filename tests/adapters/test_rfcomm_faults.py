@@ -47,6 +47,30 @@ async def test_a_robot_out_of_reach_is_searched_for_a_bounded_time(bluetooth: Bl
     assert "StopDiscovery" in await bluetooth.log()
 
 
+@pytest.mark.parametrize(
+    ("absent", "under_way"),
+    [
+        ({ROBOT: {"paired": True, "pin": "silent"}}, "ConnectProfile 00001101"),
+        ({}, "StartDiscovery"),
+    ],
+    ids=["called", "searched for"],
+)
+async def test_an_absent_robot_delays_no_other(
+    bluetooth: Bluetooth, absent: dict[str, dict[str, object]], under_way: str
+) -> None:
+    await bluetooth.start(known={**absent, OTHER: {"paired": True}})
+    async with bluetooth.robot(OTHER) as robot:
+        calling = asyncio.create_task(Rfcomm(address=ROBOT, discovery_s=60).open(Recorder()))
+        async with asyncio.timeout(PATIENCE_S):
+            while under_way not in await bluetooth.log():  # noqa: ASYNC110 — the mock tells nobody
+                await asyncio.sleep(0.01)
+            async with opened(Rfcomm(address=OTHER), Recorder()):
+                (await robot.joined())[1].close()
+        assert not calling.done()
+        calling.cancel()
+        await asyncio.wait({calling})
+
+
 async def test_without_a_bus_both_routes_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", f"unix:path={tmp_path}/nothing")
     with pytest.raises(LinkError, match="there is no D-Bus system bus") as raised:
