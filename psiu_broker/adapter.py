@@ -65,7 +65,10 @@ class Transport(ABC):
 
 
 class Adapter(BaseModel, ABC):
-    """The options of one link and how to open it."""
+    """The options of one link and how to open it.
+
+    A secret is a field with ``repr=False``: the broker tells it to nobody.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -300,6 +300,12 @@ class Broker:
         self._note(self.exchange.router.robots() if command == DISCOVER else ())
         return answer
 
+    def names(self) -> Mapping[Address, Address]:
+        """What the configuration calls the numbers in it, our own among them."""
+        own = {address: self._own_name for address in self._own_addresses()}
+        robots = self.configuration.robots.values()
+        return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
+
     async def send(self, robot: Address, command: str, request: CallRequest) -> None:
         await self.resident.tell(robot, command, request)
 
@@ -326,7 +332,7 @@ class _Bus:
         try:
             return cls(
                 session,
-                await Publisher.open(session, keys, name, _describer(broker.configuration)),
+                await Publisher.open(session, keys, name, _describer(broker.configuration), broker.names()),
                 await Calls.open(session, keys, broker.call, broker.send),
                 await Queries.open(session, keys, name, broker),
                 await RoundTrip.open(session, keys, name),
@@ -348,10 +354,11 @@ def _describer(configuration: Configuration) -> Callable[[Frame], Mapping[str, A
 
 
 def _link_table(link: LinkConfiguration) -> dict[str, Any]:
+    secret = {name for name, field in type(link.adapter).model_fields.items() if not field.repr}
     return {
         "adapter": link.adapter_name,
         "protocol": link.protocol,
-        **link.adapter.model_dump(mode="json"),
+        **link.adapter.model_dump(mode="json", exclude=secret),
         **link.codec.model_dump(mode="json"),
         **link.options.model_dump(mode="json"),
     }

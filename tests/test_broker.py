@@ -1,12 +1,14 @@
 """A whole broker in this process: real ptys, UDP sockets and a real Zenoh session; simulated robots at the far ends."""
 
 import asyncio
+import json
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from psiu_broker.broker import Broker
 from psiu_broker.config import load
@@ -272,6 +274,50 @@ async def test_why_tells_the_decision_and_its_reasons(lab: Lab) -> None:
     assert any("asked for" in step for step in unheard.steps)
 
 
+async def test_a_robot_of_bytes_stands_on_the_bus_under_its_name(lab: Lab) -> None:
+    keys: list[str] = []
+    config = zenoh.Config.from_json5(
+        json.dumps({"mode": "client", "connect": {"endpoints": list(lab.broker.configuration.zenoh.listen)}})
+    )
+    session = await asyncio.to_thread(zenoh.open, config)
+    try:
+        subscriber = session.declare_subscriber("psiu/**", lambda sample: keys.append(str(sample.key_expr)))
+        await until(lambda: lab.broker.exchange.bus.listened)
+        assert (await lab.call("BRACO", "garra", 45)).status == "sucesso"
+        await until(lambda: {"psiu/base/BRACO/node/4", "psiu/BRACO/base/ack"} <= set(keys))
+        subscriber.undeclare()
+    finally:
+        await asyncio.to_thread(session.close)
+
+
 async def test_a_port_that_is_taken_is_one_clear_line(lab: Lab) -> None:
     with pytest.raises(BusError, match="in use"):
         await Broker(load(lab.file)).start()
+
+
+async def test_the_configuration_is_told_without_secrets(tmp_path: Path) -> None:
+    file = tmp_path / "secret.toml"
+    file.write_text(
+        '[broker]\nname = "base"\n[links.r]\nadapter = "rfcomm"\naddress = "98:D3:31:00:00:01"\npin = "8877"\n'
+        'protocol = "psiu-ascii"\n'
+    )
+    broker = Broker(load(file))
+    assert broker.config()["links"]["r"]["address"] == "98:D3:31:00:00:01"
+    assert "8877" not in str(broker.config())
+    assert "8877" not in repr(broker.configuration)
+
+
+async def test_a_card_is_found_by_any_address_of_its_robot(lab: Lab) -> None:
+    await until(lambda: "BRACO" in lab.heard())
+    by_name, by_number = lab.broker.card(Address.named("BRACO")), lab.broker.card(Address.numbered(0x12))
+    assert by_name is not None
+    assert by_number is not None
+    assert by_name.robot == by_number.robot == "BRACO"
+    assert set(lab.broker.robots()) == set(lab.broker.cards())
+    assert lab.broker.card(Address.named("NOBODY")) is None
+    assert lab.broker.card(Address.named("base")) is None
+
+
+async def test_the_status_counts_what_the_bus_did(lab: Lab) -> None:
+    await until(lambda: lab.broker.status().published > 0)
+    assert (lab.broker.status().unpublished, lab.broker.status().refused_puts) == (0, 0)

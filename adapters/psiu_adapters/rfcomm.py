@@ -32,7 +32,9 @@ class Rfcomm(Adapter):
     )
     accept: bool = Field(False, description="Wait for paired phones and robots to call; each is a peer of its own")
     channel: int | None = Field(None, ge=1, le=30, description="RFCOMM channel; without it the robot is asked (SPP)")
-    pin: str = Field("1234", min_length=1, max_length=16, description="What an unpaired robot asks for; HC-05: 1234")
+    pin: str = Field(
+        "1234", min_length=1, max_length=16, repr=False, description="What an unpaired robot asks for; HC-05: 1234"
+    )
     controller: str = Field("hci0", pattern=r"^hci\d+$", description="This computer's Bluetooth controller")
     route: Literal["auto", "bluez", "socket"] = Field(
         "auto", description="bluez: over D-Bus, finds and pairs; socket: the kernel's, needs a paired robot"
