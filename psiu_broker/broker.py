@@ -302,7 +302,7 @@ class Broker:
 
     def names(self) -> Mapping[Address, Address]:
         """What the configuration calls the numbers in it, our own among them."""
-        own = {address: self._own_name for address in self._own_addresses()}
+        own = dict.fromkeys(self._own_addresses(), self._own_name)
         robots = self.configuration.robots.values()
         return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
 

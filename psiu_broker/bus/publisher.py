@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
@@ -35,10 +36,12 @@ class Publisher:
 
     Read `listened` (somebody subscribes to decoded frames) before `publish`, and `raw_listened`
     then `tapped(link)` before building a `RawFrame`: both are plain attributes that follow the
-    subscribers. `puts` and `failures` count.
+    subscribers. `puts` and `failures` count. `names` are what robots known by a number are called.
     """
 
-    def __init__(self, session: Session, keys: Keys, broker: str, describe: Describe) -> None:
+    def __init__(
+        self, session: Session, keys: Keys, broker: str, describe: Describe, names: Mapping[Address, Address]
+    ) -> None:
         self.listened = False
         self.raw_listened = False
         self.puts = 0
@@ -47,18 +50,26 @@ class Publisher:
         self._keys = keys
         self._broker = broker
         self._describe = describe
+        self._names = names
         self._cards: dict[Address, bytes] = {}
         self._frames = lru_cache(KEYS_MAX)(self._declare_frames)
         self._taps = lru_cache(KEYS_MAX)(self._declare_tap)
 
     @classmethod
-    async def open(cls, session: Session, keys: Keys, broker: str, describe: Describe) -> "Publisher":
+    async def open(
+        cls,
+        session: Session,
+        keys: Keys,
+        broker: str,
+        describe: Describe,
+        names: Mapping[Address, Address] = MappingProxyType({}),
+    ) -> "Publisher":
         """Begin to watch who listens.
 
         Raises:
             BusError: the session is closed or lost.
         """
-        publisher = cls(session, keys, broker, describe)
+        publisher = cls(session, keys, broker, describe, names)
         await publisher._watch(keys.every_frame, "listened")
         await publisher._watch(keys.every_raw(broker), "raw_listened")
         return publisher
@@ -122,8 +133,8 @@ class Publisher:
 
     def _decoded(self, frame: Frame, way: Way, received: float) -> str:
         return Decoded(
-            source=str(frame.source),
-            destination=str(frame.destination),
+            source=str(self._names.get(frame.source, frame.source)),
+            destination=str(self._names.get(frame.destination, frame.destination)),
             protocol=frame.protocol,
             broker=self._broker,
             link=way.link,
@@ -156,7 +167,9 @@ class Publisher:
         self._session.bridge(listener, lambda status: status, look, name=f"bus-{flag}")
 
     def _declare_frames(self, source: Address, destination: Address, subject: str) -> zenoh.Publisher:
-        return self._declare(self._keys.decoded(source, destination, subject), _DECODED)
+        names = self._names
+        key = self._keys.decoded(names.get(source, source), names.get(destination, destination), subject)
+        return self._declare(key, _DECODED)
 
     def _declare_tap(self, link: str) -> zenoh.Publisher:
         return self._declare(self._keys.raw(self._broker, link), _RAW)
