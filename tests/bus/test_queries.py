@@ -23,6 +23,7 @@ class Broker:
     def __init__(self) -> None:
         self.known = [Address.named("MNERIM"), Address.named("0x12"), Address.numbered(0x12)]
         self.built: list[Address] = []
+        self.listed = False
 
     def status(self) -> Status:
         return Status(
@@ -59,6 +60,7 @@ class Broker:
         return Why(a=str(a), b=str(b), delivered=True, verdict=f"{a!r} {b!r}", steps=[])
 
     def robots(self) -> Iterable[Address]:
+        self.listed = True
         return self.known
 
     def card(self, robot: Address) -> Card | None:
@@ -160,7 +162,8 @@ async def test_one_card_comes_alone_and_a_stranger_has_none(
     queries: Queries, program: zenoh.Session, broker: Broker
 ) -> None:
     assert set(await ask(program, "psiu/MNERIM")) == {"psiu/MNERIM"}
-    assert broker.built == [Address.named("MNERIM")]  # and nobody else's
+    assert broker.built == [Address.named("MNERIM")]
+    assert not broker.listed  # what one robot costs does not depend on how many there are
     assert set(await ask(program, "psiu/0x12")) == {"psiu/0x12"}
     assert await ask(program, "psiu/STRANGER") == {}
     assert await ask(program, "psiu/%ED%A0%80") == {}
