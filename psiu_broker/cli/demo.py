@@ -30,7 +30,6 @@ WHOLE_S: Final = 18.0
 STEP_S: Final = 5.0
 GARRA: Final = 4
 ARM: Final = 0x12
-NAMES: Final = {"0x00": "base", "0x12": "BRACO"}
 
 CONFIGURATION: Final = """\
 [broker]
@@ -266,7 +265,7 @@ class Listener:
                 message = read_message(payload)
                 if kind == "put":
                     self._seen.append(message)
-                    click.echo(f"    {message_line(key, message, NAMES)}")
+                    click.echo(f"    {message_line(key, message)}")
         except (PsiuError, BrokenPipeError):
             return  # the client was closed, or nobody reads
 

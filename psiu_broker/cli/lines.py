@@ -28,18 +28,18 @@ def frame_words(message: Message) -> str:
     return f"{text} [{message['remark']}]" if message.get("remark") else text
 
 
-def frame_line(message: Message, names: Mapping[str, str]) -> str:
-    """A `Decoded`: when, who to whom, what, and on which link. `names` are the robots of addresses."""
+def frame_line(message: Message) -> str:
+    """A `Decoded`: when, who to whom, what, and on which link."""
     words = styled(printable(frame_words(message)), fg=_COLOURS.get(str(message.get("status"))), bold=True)
-    return f"{_when(message)}  {_pair(message, names)}  {words}  {_dim(message.get('link'))}"
+    return f"{_when(message)}  {_pair(message)}  {words}  {_dim(message.get('link'))}"
 
 
-def raw_line(message: Message, names: Mapping[str, str]) -> str:
+def raw_line(message: Message) -> str:
     """A `RawFrame`: when, in or out, on which link, what became of it, and its bytes."""
     place = "/".join(str(message[part]) for part in ("link", "peer") if message.get(part))
     verdict = str(message.get("verdict"))
     detail = f" ({message['detail']})" if message.get("detail") else ""
-    who = f"{_pair(message, names)}  {message.get('subject')}  " if message.get("source") is not None else ""
+    who = f"{_pair(message)}  {message.get('subject')}  " if message.get("source") is not None else ""
     colour = {"delivered": "green", "answered": "green"}.get(verdict, "red")
     told = styled(printable(verdict + detail), fg=colour)
     return (
@@ -63,9 +63,8 @@ def gone_line(robot: str) -> str:
     return f"{_clock(datetime.now())}  {_dim(printable(f'{robot} is gone'))}"
 
 
-def _pair(message: Message, names: Mapping[str, str]) -> str:
-    source, destination = (str(message.get(part) or "?") for part in ("source", "destination"))
-    return printable(f"{names.get(source, source)} → {names.get(destination, destination)}")
+def _pair(message: Message) -> str:
+    return printable(f"{message.get('source') or '?'} → {message.get('destination') or '?'}")
 
 
 def _when(message: Message) -> str:

@@ -1,7 +1,7 @@
 """`psiu monitor`: what happens on the bus, as it happens."""
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
@@ -42,8 +42,6 @@ def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
     if key is not None and raw is not None:
         raise click.UsageError("give a KEY or --raw, not both")
     with connection.client() as client, suppress(KeyboardInterrupt):
-        cards = client.cards()
-        names = Names(cards)
         wanted: Wanted = _anything
         if raw is not None:
             asked = f"{client.keys.prefix}/@raw/*/{'*' if raw == 'all' else chunk(raw)}"
@@ -51,37 +49,24 @@ def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
             asked = key
         else:
             asked = f"{client.keys.prefix}/**"
-            wanted = _anything if key is None else _of(key, cards)
+            wanted = _anything if key is None else _of(key, client.cards())
         if sys.stderr.isatty():
             click.echo(f"Listening to {printable(asked)}; Ctrl-C ends.", err=True)
         try:
             for at, kind, payload in client.monitor(asked):
                 message = _gone(client, at) if kind == "delete" else read_message(payload)
                 if wanted(message):
-                    names.learn(message)
-                    click.echo(_json(at, message) if connection.as_json else message_line(at, message, names.known))
+                    click.echo(_json(at, message) if connection.as_json else message_line(at, message))
         except BrokenPipeError:
             closed_pipe_is_fine()
 
 
-class Names:
-    """The robots by their addresses, so that people read names."""
-
-    def __init__(self, cards: Iterable[Card]) -> None:
-        self.known = {card.address: card.robot for card in cards if card.address is not None}
-
-    def learn(self, message: Message) -> None:
-        """Take in a card."""
-        if "link_state" in message and message.get("address"):
-            self.known[str(message["address"])] = str(message.get("robot"))
-
-
-def message_line(key: str, message: Message, names: Mapping[str, str]) -> str:
+def message_line(key: str, message: Message) -> str:
     """A message of the bus for a person, known by its fields."""
     if "verdict" in message and "direction" in message:
-        return raw_line(message, names)
+        return raw_line(message)
     if "kind" in message and "source" in message:
-        return frame_line(message, names)
+        return frame_line(message)
     if "link_state" in message:
         return card_line(message)
     if "gone" in message:

@@ -45,8 +45,8 @@ def test_a_person_reads_when_who_what_and_where_until_ctrl_c(watch: Any, lab: An
     with watch(sign="distancia 42") as monitor:
         lab.run("call", "BRACO", "garra", "30")
         monitor.until(r"^\d\d:\d\d:\d\d\.\d\d\d  MNERIM → base  distancia 42  radio$")
-        monitor.until(r"^\S+  0x00 → BRACO  garra 29\.76 deg \(node 4, signal 42\)  @self$")
-        monitor.until(r"BRACO → 0x00  ack  arm$")
+        monitor.until(r"^\S+  base → BRACO  garra 29\.76 deg \(node 4, signal 42\)  @self$")
+        monitor.until(r"BRACO → base  ack  arm$")
 
 
 def test_a_program_reads_one_object_a_line(watch: Any, lab: Any) -> None:
@@ -64,13 +64,14 @@ def test_a_program_reads_one_object_a_line(watch: Any, lab: Any) -> None:
     assert answer["key"] == "psiu/MNERIM/base/trava"
 
 
-def test_one_robot_is_watched_by_its_name_and_hears_under_its_address(watch: Any, lab: Any) -> None:
-    with watch("BRACO", "--json", sign='"node"', robot="BRACO", command="sonar") as monitor:
+@pytest.mark.parametrize("name", ["BRACO", "0x12"])
+def test_one_robot_is_watched_by_its_name_or_its_address(watch: Any, lab: Any, name: str) -> None:
+    with watch(name, "--json", sign='"node"', robot="BRACO", command="sonar") as monitor:
         lab.run("call", "MNERIM", "distancia")
         lab.run("call", "BRACO", "garra", "7")
         monitor.until('"command":"garra"')
     told = [json.loads(line) for line in monitor.out]
-    assert all("0x12" in (each.get("source"), each.get("destination"), each.get("address")) for each in told)
+    assert all("BRACO" in (each.get("source"), each.get("destination"), each.get("robot")) for each in told)
 
 
 def test_a_key_with_wildcards_is_taken_as_it_is(watch: Any, lab: Any) -> None:
