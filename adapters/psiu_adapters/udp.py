@@ -5,14 +5,19 @@ import errno
 import logging
 import os
 import socket
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import cached_property
 from typing import ClassVar, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from psiu_adapters.aside import Aside
 from psiu_adapters.udp_sockets import (
+    NO_NETWORK,
     Address,
     bound,
+    has_route,
     is_broadcast,
     is_multicast,
     is_own,
@@ -23,7 +28,7 @@ from psiu_adapters.udp_sockets import (
     split,
 )
 from psiu_broker.adapter import Adapter, Peer, Receiver, Transport
-from psiu_broker.errors import LinkError, LinkLost
+from psiu_broker.errors import LinkAbsent, LinkError, LinkLost
 
 DATAGRAM_BYTES = 2048
 DRAIN_DATAGRAMS = 32
@@ -65,7 +70,7 @@ class Udp(Adapter):
     interface: str = Field(default="", description="name of the network interface for multicast groups, such as wlan0")
     learn: bool = Field(default=True, description="also talk with whoever sends to us; false: only with `peers`")
     max_peers: int = Field(default=64, ge=1, description="how many senders are learned; the rest are refused")
-    peer_ttl_s: float = Field(default=300.0, gt=0, description="a learned sender silent for so long is forgotten")
+    peer_ttl_s: float = Field(default=300.0, ge=1, description="a learned sender silent for so long is forgotten")
     reuse: bool = Field(default=False, description="share the port with other programs that do the same")
 
     @field_validator("listen")
@@ -93,9 +98,32 @@ class Udp(Adapter):
                 )
         return self
 
+    @property
+    def many_peers(self) -> bool:
+        numbers = map(numeric, self.peers)
+        return self.learn or len(self.peers) > 1 or any(found and is_multicast(found[1]) for found in numbers)
+
+    def peer_named(self, text: str) -> Peer:
+        try:
+            found = numeric(text)
+        except ValueError:
+            found = None
+        if found is None:
+            raise ValueError(f'expected "ADDRESS:PORT", got "{text}"; write it in numbers, like "192.168.1.20:9001"')
+        if found not in map(numeric, self.peers):
+            raise ValueError(f"{text} is not among the peers of its link; add it there")
+        return _peer(found[1])
+
+    @cached_property
+    def _aside(self) -> Aside:
+        """At most one thread of a link waits for the name server, however often the link is opened."""
+        return Aside(f"{self.listen} resolves")
+
     async def open(self, receiver: Receiver) -> Transport:
-        family, address = await resolve(self.listen, socket.AF_UNSPEC)
-        transport = _UdpTransport(self, family, bound(family, address, self.listen, reuse=self.reuse), receiver)
+        family, address = (await resolve(self.listen, socket.AF_UNSPEC, self._aside))[0]
+        transport = _UdpTransport(
+            self, family, bound(family, address, self.listen, reuse=self.reuse), receiver, self._aside
+        )
         try:
             await transport.begin()
         except BaseException:
@@ -104,13 +132,17 @@ class Udp(Adapter):
         return transport
 
 
+def _peer(address: Address) -> tuple[str, int]:
+    return address[0], address[1]
+
+
 class _Entry:
     """One peer: the very object that `Receiver.received` is told, where to send, and how long it has been silent."""
 
     __slots__ = ("address", "fixed", "peer", "silent")
 
-    def __init__(self, peer: tuple[str, int], address: Address, fixed: bool) -> None:
-        self.peer = peer
+    def __init__(self, address: Address, fixed: bool) -> None:
+        self.peer = _peer(address)
         self.address = address
         self.fixed = fixed
         self.silent = 0
@@ -119,7 +151,7 @@ class _Entry:
 class _UdpTransport(Transport):
     """`_by_address` answers "who sent this", `_by_peer` "where to"; both hold the same entries."""
 
-    def __init__(self, options: Udp, family: int, main: socket.socket, receiver: Receiver) -> None:
+    def __init__(self, options: Udp, family: int, main: socket.socket, receiver: Receiver, aside: Aside) -> None:
         self._options = options
         self._family = family
         self._receiver = receiver
@@ -133,11 +165,14 @@ class _UdpTransport(Transport):
         self._groups = False
         self._own: set[Address] = set()
         self._reading = False
-        self._unresolved = list(options.peers)
+        self._aside = aside
+        self._placed: dict[str, Address] = {}
+        self._looked_up = asyncio.Event()
         self._learned = 0
         self._refused = 0
         self._oversized = 0
         self._send_errors = 0
+        self._last_send_error = ""
         self._closed = False
         self._sweeper: asyncio.TimerHandle | None = None
         self._resolver: asyncio.Task[None] | None = None
@@ -146,14 +181,21 @@ class _UdpTransport(Transport):
         """Find the fixed peers, join their groups, and read from now on.
 
         Raises:
-            LinkError: a group cannot be joined.
+            LinkError: a group cannot be joined, or the network of every peer is down.
         """
+        names = []
         for text in self._options.peers:
             if found := numeric(text):
                 self._add_fixed(text, found[1])
-        if self._unresolved:
-            self._resolver = self._loop.create_task(self._resolve())
-            await asyncio.wait({self._resolver}, timeout=RESOLVE_FIRST_S)
+            else:
+                names.append(text)
+        if names:
+            self._resolver = self._loop.create_task(self._follow(names))
+            with suppress(TimeoutError):
+                async with asyncio.timeout(RESOLVE_FIRST_S):
+                    await self._looked_up.wait()
+        if self._by_address and not self._has_network():
+            raise LinkAbsent(f"{self._options.listen}: no network leads to its peers; waiting for one")
         for receiving in self._sockets:
             self._read_from(receiving)
         self._reading = True
@@ -173,16 +215,14 @@ class _UdpTransport(Transport):
         except BlockingIOError:
             self._loop.add_writer(self._main.fileno(), self._has_room)
             return False
-        except OSError:
-            self._send_errors += 1
+        except OSError as error:
+            self._send_failed(error)
         return True
 
     async def close(self) -> None:
-        if self._closed:
-            return
-        self._stop()
+        if not self._closed:
+            self._stop()
         if self._resolver is not None:
-            self._resolver.cancel()
             await asyncio.wait({self._resolver})
 
     def status(self) -> Mapping[str, str | int | float]:
@@ -196,8 +236,10 @@ class _UdpTransport(Transport):
             host, port = self._main.getsockname()[:2]
             facts["listen"] = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
             facts["lost"] = sum(map(kernel_drops, self._sockets))
-        if self._unresolved:
-            facts["unresolved"] = ", ".join(self._unresolved)
+        if self._last_send_error:
+            facts["last_send_error"] = self._last_send_error
+        if unresolved := [text for text in self._options.peers if text not in self._placed]:
+            facts["unresolved"] = ", ".join(unresolved)
         return facts
 
     def _read_from(self, receiving: socket.socket) -> None:
@@ -249,7 +291,7 @@ class _UdpTransport(Transport):
     def _add(self, address: Address, *, fixed: bool) -> _Entry:
         entry = self._by_address.get(address)
         if entry is None:
-            entry = _Entry((address[0], address[1]), address, fixed)
+            entry = _Entry(address, fixed)
             self._by_address[address] = self._by_peer[entry.peer] = entry
         elif fixed and not entry.fixed:
             entry.fixed = True
@@ -277,20 +319,31 @@ class _UdpTransport(Transport):
         for entry in gone:
             self._receiver.peer_lost(entry.peer)
 
-    async def _resolve(self) -> None:
-        """Add the fixed peers that are known by name, each once its name has an address."""
+    async def _follow(self, names: Sequence[str]) -> None:
+        """Add the fixed peers that are known by name once they have an address, and go along when they move."""
         pause_s = RESOLVE_FIRST_S
         while True:
-            for text in list(self._unresolved):
+            for text in names:
                 try:
-                    _, address = await resolve(text, self._family)
-                    self._add_fixed(text, address)
+                    found = await resolve(text, self._family, self._aside)
+                    self._place(text, [address for _, address in found])
                 except LinkError as error:
                     log.debug("%s", error)
-            if not self._unresolved:
-                return
+            self._looked_up.set()
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, RESOLVE_LAST_S)
+
+    def _place(self, text: str, addresses: Sequence[Address]) -> None:
+        """The fixed peer `text` has these addresses now: it stays where it is if that is one of them."""
+        before = self._placed.get(text)
+        if before in addresses or (before is not None and is_multicast(before)):
+            return
+        self._add_fixed(text, addresses[0])
+        if before is not None and before not in self._placed.values():
+            entry = self._by_address.pop(before)
+            del self._by_peer[entry.peer]
+            self._count_everyone()
+            self._receiver.peer_lost(entry.peer)
 
     def _add_fixed(self, text: str, address: Address) -> None:
         if is_multicast(address):
@@ -302,12 +355,23 @@ class _UdpTransport(Transport):
             self._groups = True
         elif is_broadcast(self._family, address):
             self._groups = True
-        self._unresolved.remove(text)
+        self._placed[text] = address
         self._add(address, fixed=True)
 
     def _has_room(self) -> None:
         self._loop.remove_writer(self._main.fileno())
         self._receiver.writable()
+
+    def _send_failed(self, error: OSError) -> None:
+        self._send_errors += 1
+        self._last_send_error = os.strerror(error.errno or 0).lower()
+        if error.errno in NO_NETWORK and not self._has_network():
+            # Not from inside write: the caller is in the middle of emptying its outbox.
+            self._loop.call_soon(self._lose, error)
+
+    def _has_network(self) -> bool:
+        """Whether there is a way to any peer: a single one without may be wrong, all of them mean no network."""
+        return any(has_route(self._family, address) for address in self._by_address)
 
     def _lose(self, error: OSError) -> None:
         if not self._closed:
@@ -321,6 +385,8 @@ class _UdpTransport(Transport):
         self._everyone = ()
         if self._sweeper is not None:
             self._sweeper.cancel()
+        if self._resolver is not None:
+            self._resolver.cancel()
         for each in self._sockets:
             self._loop.remove_reader(each.fileno())
             self._loop.remove_writer(each.fileno())

@@ -1,6 +1,5 @@
 """UDP sockets as the adapter needs them: addresses read, bound, groups joined; refusals in words."""
 
-import asyncio
 import errno
 import ipaddress
 import logging
@@ -10,6 +9,7 @@ import socket
 import struct
 from typing import Any
 
+from psiu_adapters.aside import Aside
 from psiu_broker.errors import LinkAbsent, LinkBusy, LinkError
 
 Address = tuple[Any, ...]
@@ -24,6 +24,8 @@ IPV6_MULTICAST_ALL = 29
 SO_MEMINFO = 55
 MEMINFO_DROPS = 8
 
+NO_NETWORK = {errno.ENETUNREACH, errno.ENETDOWN}
+
 log = logging.getLogger(__name__)
 
 
@@ -36,7 +38,14 @@ def split(text: str) -> tuple[str, int]:
     match = HOST_PORT.fullmatch(text)
     if not match or int(match["port"]) > 65535:
         raise ValueError(f"expected host:port, such as 127.0.0.1:9000 or [::1]:9000, got {text!r}")
-    return match["v6"] or match["host"], int(match["port"])
+    host = match["v6"] or match["host"]
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        raise ValueError(
+            f"got {text!r}: no host can be called {host!r}, whose parts between dots must have 1 to 63 letters"
+        ) from None
+    return host, int(match["port"])
 
 
 def numeric(text: str) -> tuple[int, Address] | None:
@@ -49,20 +58,20 @@ def numeric(text: str) -> tuple[int, Address] | None:
     return found[0][0], found[0][4]
 
 
-async def resolve(text: str, family: int) -> tuple[int, Address]:
-    """Family and address of ``host:port``.
+async def resolve(text: str, family: int, aside: Aside) -> list[tuple[int, Address]]:
+    """Family and address of ``host:port``, and of every other address that the host has.
 
     Raises:
         LinkAbsent: the name has no address of this family (now).
     """
     if known := numeric(text):
-        return known
+        return [known]
     host, port = split(text)
     try:
-        found = await asyncio.get_running_loop().getaddrinfo(host, port, family=family, type=socket.SOCK_DGRAM)
-    except socket.gaierror as error:
+        found = await aside.run(lambda: socket.getaddrinfo(host, port, family, socket.SOCK_DGRAM))
+    except OSError as error:
         raise LinkAbsent(f"{text}: cannot find the address of {host} ({error.strerror})") from error
-    return found[0][0], found[0][4]
+    return [(each[0], each[4]) for each in found]
 
 
 def bound(family: int, address: Address, text: str, *, reuse: bool) -> socket.socket:
@@ -150,6 +159,16 @@ def is_broadcast(family: int, address: Address) -> bool:
         except OSError:
             return bool(address[0] == "255.255.255.255")
     return False
+
+
+def has_route(family: int, address: Address) -> bool:
+    """Whether the kernel knows a way to `address`, or at least does not say that there is none."""
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(address)
+        except OSError as error:
+            return error.errno not in NO_NETWORK
+    return True
 
 
 def is_own(main: socket.socket, address: Address) -> bool:

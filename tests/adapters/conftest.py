@@ -26,8 +26,9 @@ def pty(tmp_path: Path) -> Iterator[Pty]:
 
 
 @pytest.fixture
-def robot() -> Iterator[Robot]:
-    far = Robot()
+def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
+    """One that speaks IPv4, or what the test's own parameters say."""
+    far = Robot(*getattr(request, "param", ()))
     yield far
     far.socket.close()
 
