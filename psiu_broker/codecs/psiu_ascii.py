@@ -56,6 +56,18 @@ _MISREAD: Final = re.compile(rb" \d{3}( |\Z)")
 
 _SIZES: Final = tuple(b"%03d" % size for size in range(LONGEST + 1))
 
+
+class _Checksums(dict[int, bytes]):
+    """Sums as text, each written when it first occurs: writing one takes ten times as long as looking it up."""
+
+    def __missing__(self, total: int) -> bytes:
+        text = self[total] = b"%05d" % total
+        return text
+
+
+_CHECKSUMS: Final = _Checksums()
+_PRINTABLE_BYTES: Final = bytes(range(0x20, 0x7F))
+
 _STEP: Final = 1024
 _MOST_WORDS: Final = 1024
 """Names, and command words, that are remembered as text."""
@@ -152,33 +164,32 @@ class PsiuAscii(Codec):
 
     def _whole(self, data: bytes) -> Frame | None:
         """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case."""
-        words = data.split(b" ")
-        if len(words) < 5:
-            return None
-        checksum = words[-1]
-        if len(checksum) == 7 and checksum[5:] == b"\r\n":
-            checksum = checksum[:5]
+        if data[-2:] == b"\r\n":
             data = data[:-2]
-        size = len(data)
-        if size > LONGEST or words[1] != _SIZES[size] or checksum != b"%05d" % byte_sum(data[:-5]):
+        try:
+            destination, size, rest = data.split(b" ", 2)
+            payload, source, checksum = rest.rsplit(b" ", 2)
+        except ValueError:
             return None
-        source = self._names.get(words[-2])
-        destination = self._names.get(words[0])
-        subject = self._subjects.get(words[2])
-        if source is None or destination is None or subject is None:
+        length = len(data)
+        if length > LONGEST or size != _SIZES[length] or checksum != _CHECKSUMS[byte_sum(data[:-5])]:
             return None
-        sender = size - 6 - len(words[-2])
-        if len(words) > 5:
-            # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
-            if not data.isascii() or not data.decode().isprintable() or self._may_begin_a_name(words):
-                return None
-        payload = data[len(words[0]) + 5 : sender - 1]
-        return _make(Frame, (source, destination, subject, payload, PROTOCOL, data, _CANONICAL, ""))
+        subject = self._subjects.get(payload.partition(b" ")[0])
+        to = self._names.get(destination)
+        sender = self._names.get(source)
+        if subject is None or to is None or sender is None:
+            return None
+        # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
+        if payload.translate(None, _PRINTABLE_BYTES):
+            return None
+        if self._directory.names and self._may_begin_a_name(payload + b" " + source):
+            return None
+        return _make(Frame, (sender, to, subject, payload, PROTOCOL, data, _CANONICAL, ""))
 
-    def _may_begin_a_name(self, words: list[bytes]) -> bool:
-        """Whether one of the parameters in `words` and all behind it, up to the checksum, is a known name."""
-        names = self._directory.names
-        return bool(names) and any(b" ".join(words[at:-1]).decode() in names for at in range(3, len(words) - 2))
+    def _may_begin_a_name(self, message: bytes) -> bool:
+        """Whether a known name with spaces is at the end of `message`, behind its command word."""
+        words = message.decode().split(" ")
+        return any(" ".join(words[at:]) in self._directory.names for at in range(1, len(words) - 1))
 
     def _sender(self, text: str, start: int, space: int, end: int) -> int:
         """The space before the sender's name, which ends at `end`: the longest known one, else the word after `space`.

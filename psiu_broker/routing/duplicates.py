@@ -19,7 +19,7 @@ class Duplicates:
 
     __slots__ = ("_capacity", "_new", "_old", "_same_link_s", "_since", "_window_s")
 
-    def __init__(self, window_s: float = 4.0, same_link_s: float = 0.25, *, capacity: int = 65_536) -> None:
+    def __init__(self, window_s: float = 4.0, same_link_s: float = 0.25, *, capacity: int = 16_384) -> None:
         self._window_s = window_s
         self._same_link_s = same_link_s
         self._capacity = capacity
