@@ -64,6 +64,13 @@ WIFI = """
     listen = "127.0.0.1:9000"
     protocol = "psiu-ascii"
 """
+PHONES = """
+    [links.phones]
+    adapter = "rfcomm"
+    accept = true
+    protocol = "psiu-ascii"
+"""
+ROBOT_WIFI = WIFI.replace("psiu-ascii", "psiu-hexa") + 'topology = "point-to-point"\nremote = 3\n'
 
 
 @pytest.fixture
@@ -131,10 +138,15 @@ def test_a_robot_s_address_is_in_the_domain_of_its_link(read):
 
 
 def test_a_udp_robot_s_peer_is_what_the_adapter_calls_it(read):
-    for peer, address in (("127.0.0.1:9001", ("127.0.0.1", 9001)), ("[::1]:9001", ("::1", 9001, 0, 0))):
+    for peer, address in (("127.0.0.1:9001", ("127.0.0.1", 9001)), ("[::1]:9001", ("::1", 9001))):
         wifi = WIFI.replace("127.0.0.1:9000", peer.replace("9001", "9000"))
         text = f'{BROKER}{wifi}peers = ["{peer}"]\n[robots.MNERIM]\nlink = "wifi"\npeer = "{peer}"\n'
         assert read(text).robots["MNERIM"].peer == address
+
+
+def test_a_phone_s_peer_is_its_address_in_upper_case(read):
+    text = BROKER + PHONES + '[robots.A]\nlink = "phones"\npeer = "98:d3:31:00:00:0a"\n'
+    assert read(text).robots["A"].peer == "98:D3:31:00:00:0A"
 
 
 def test_a_broker_without_links_is_allowed(read):
@@ -236,6 +248,18 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         ),
         ('[zenoh]\nlisten = ["serial/dev/ttyUSB0:1"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),
         ('[zenoh]\nlisten = ["tcp/[::1]:99999"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),
+        (
+            '[zenoh]\nlisten = ["tcp/127.0.0.1:0"]',
+            'zenoh.listen[0]: got "tcp/127.0.0.1:0": port 0 is another one at each start; name one',
+        ),
+        ("[zenoh]\nlisten = []", "zenoh.listen: expected at least one place, got none; leave listen out"),
+        (
+            '[zenoh]\nlisten = ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2", "tcp/127.0.0.1:1"]',
+            'zenoh.listen: "tcp/127.0.0.1:1" is there twice; remove one',
+        ),
+        (WIFI.replace("127.0.0.1", "a..b"), "links.wifi.listen: got 'a..b:9000': no host can be called 'a..b'"),
+        (WIFI + f'peers = ["{"a" * 64}.lan:9001"]', "links.wifi.peers: got 'aaaaaaaaaaaaaaaaaaaa"),
+        (WIFI + "peer_ttl_s = 0.9", "links.wifi.peer_ttl_s: expected a number greater than or equal to 1, got 0.9"),
         ('[zenoh]\nprefix = "psiu/**"', "zenoh.prefix: expected words of"),
         (
             HEXA + '[robots.A]\nlink="hexa"\naddress=256',
@@ -256,6 +280,16 @@ def test_a_wrong_value_is_refused_with_what_was_expected_and_what_was_got(proble
 def test_the_broker_s_name_is_one_that_a_robot_can_have(problems, name):
     (line,) = problems(f'[broker]\nname = "{name}"')
     assert line.startswith("broker.name: expected a name")
+
+
+def test_the_broker_s_name_is_one_that_robots_cannot_misread(problems):
+    (line,) = problems('[broker]\nname = "my base"')
+    expected = 'broker.name: expected a name without spaces, got "my base": a robot that has not met it misreads it'
+    assert line.startswith(expected)
+
+
+def test_a_robot_s_name_may_have_spaces(read):
+    assert "MEU ROBO" in read(BROKER + RADIO + '[robots."MEU ROBO"]\nlink = "radio"').robots
 
 
 def test_a_robot_s_name_is_not_an_address(problems):
@@ -342,8 +376,62 @@ def test_a_robot_s_name_is_not_an_address(problems):
         ),
         pytest.param(
             WIFI + '[robots.A]\nlink="wifi"\npeer="127.0.0.1:9001"',
-            "robots.A.peer: 127.0.0.1:9001 is not among links.wifi.peers; add it there",
+            "robots.A.peer: 127.0.0.1:9001 is not among the peers of its link; add it there",
             id="a peer that the link does not have",
+        ),
+        pytest.param(
+            RADIO + '[robots.A]\nlink="radio"\npeer="anything"',
+            "robots.A.peer: is for links with several far ends, and this one has a single one; remove it",
+            id="a peer on a serial link",
+        ),
+        pytest.param(
+            PHONES.replace("accept = true", 'address = "98:D3:31:00:00:01"')
+            + '[robots.A]\nlink="phones"\npeer="98:D3:31:00:00:01"',
+            "robots.A.peer: is for links with several far ends, and this one has a single one; remove it",
+            id="a peer on a link that calls one robot",
+        ),
+        pytest.param(
+            PHONES + '[robots.A]\nlink="phones"\npeer="my phone"',
+            "robots.A.peer: not a Bluetooth address",
+            id="a phone without an address",
+        ),
+        pytest.param(
+            PHONES + PHONES.replace("links.phones", "links.more"),
+            "links.more.accept: link phones takes all who call hci0 already; keep one of them",
+            id="two links that accept",
+        ),
+        pytest.param(
+            PHONES.replace("psiu-ascii", "psiu-hexa") + 'topology = "point-to-point"\nremote = 3',
+            "links.phones.topology: point-to-point packets name no robot, and this link may reach several",
+            id="point-to-point with phones",
+        ),
+        pytest.param(
+            ROBOT_WIFI + 'peers = ["127.0.0.1:9001"]',
+            "links.wifi.topology: point-to-point packets name no robot, and this link may reach several",
+            id="point-to-point with learned robots",
+        ),
+        pytest.param(
+            ROBOT_WIFI + 'learn = false\npeers = ["127.0.0.1:9001", "127.0.0.1:9002"]',
+            "links.wifi.topology: point-to-point packets name no robot, and this link may reach several",
+            id="point-to-point with two peers",
+        ),
+        pytest.param(
+            ARM + "local = 7\nremote = 7",
+            "links.arm.remote: 7 is the broker's own address there; give the robot's",
+            id="both ends with one address",
+        ),
+        pytest.param(
+            ARM + '[robots.A]\nlink="arm"\naddress=0',
+            "robots.A.address: 0x00 is the address of the broker itself already",
+            id="a far end with our address",
+        ),
+        pytest.param(
+            HEXA
+            + "local = 5\n"
+            + HEXA.replace("hexa", "more").replace("psiu-more", "psiu-hexa")
+            + '[robots.A]\nlink="more"\naddress=5',
+            "robots.A.address: 0x05 is the address of the broker itself already",
+            id="our address on another link of the domain",
         ),
         pytest.param(
             RADIO.replace("links.radio", 'links."my radio"'),
@@ -362,6 +450,14 @@ def test_what_cannot_work_together_is_refused(problems, text, expected):
     [
         WIFI + WIFI.replace("links.wifi", "links.lan").replace("9000", "9001"),
         WIFI + WIFI.replace("links.wifi", "links.lan").replace("127.0.0.1", "127.0.0.2"),
+        WIFI.replace("127.0.0.1", "[::]") + WIFI.replace("links.wifi", "links.lan").replace("127.0.0.1", "0.0.0.0"),
+        WIFI.replace("127.0.0.1", "[::]") + WIFI.replace("links.wifi", "links.lan"),
+        PHONES + PHONES.replace("links.phones", "links.more") + 'controller = "hci1"',
+        RADIO + ROBOT_WIFI + 'learn = false\npeers = ["127.0.0.1:9001"]',
+        RADIO.replace("psiu-ascii", "psiu-hexa").replace("radio", "hexa")
+        + "local = 5\n"
+        + WIFI
+        + '[robots.A]\nlink="hexa"\naddress=0',
         (WIFI + WIFI.replace("links.wifi", "links.lan")).replace(":9000", ":0"),
         HEXA + HEXA.replace("hexa]", "blue]").replace("by-id/hexa", "by-id/blue") + 'domain="blue"\n'
         '[robots.A]\nlink="hexa"\naddress=1\n[robots.B]\nlink="blue"\naddress=1',
@@ -488,7 +584,7 @@ def test_what_is_allowed_but_risky_is_warned_of(read, text, expected):
 
 
 def test_loopback_is_not_warned_of(read):
-    listen = '["tcp/127.0.0.2:0", "tcp/localhost:7447", "tcp/[::1]:7447", "unixsock-stream//run/psiu"]'
+    listen = '["tcp/127.0.0.2:7448", "tcp/localhost:7447", "tcp/[::1]:7447", "unixsock-stream//run/psiu"]'
     assert read(BROKER + f"[zenoh]\nlisten = {listen}").warnings == ()
 
 
@@ -507,6 +603,7 @@ def test_the_schema_accepts_the_readme_s_configuration_and_refuses_what_loading_
         ("robots", "BRACO", "nodes", "garra", "type"): "srvo",
         ("broker", "address"): 256,
         ("other",): 1,
+        ("zenoh", "listen"): [],
     }.items():
         bad = json.loads(json.dumps(good))
         table = bad

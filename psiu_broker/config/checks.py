@@ -2,10 +2,11 @@
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from ipaddress import ip_address
 from typing import Final
 
+from psiu_broker.adapter import Adapter
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.problems import Key, Problems, got
 from psiu_broker.config.tables import (
@@ -34,8 +35,8 @@ def check_nodes(nodes: Mapping[str, Node], key: Key, problems: Problems) -> None
             problems.add((*at, "node"), f"node {node.node} is {first} already; give it one name")
 
 
-def check_devices(links: Iterable[LinkConfiguration], problems: Problems) -> None:
-    """A serial port, a UDP port or a robot's Bluetooth address belongs to one link."""
+def check_devices(links: Collection[LinkConfiguration], problems: Problems) -> None:
+    """A serial port, a UDP port, a robot's Bluetooth address or the calls to a controller belong to one link."""
     held: list[tuple[str, str, str]] = []
     for link in links:
         for option in ("device", "address", "listen"):
@@ -47,6 +48,13 @@ def check_devices(links: Iterable[LinkConfiguration], problems: Problems) -> Non
                     text = f"{got(mine)} is taken by link {holder} already; give each link its own"
                     problems.add(("links", link.name, option), text)
             held.append((option, mine, link.name))
+    accepting: dict[str, str] = {}
+    for link in links:
+        if getattr(link.adapter, "accept", None) is True:
+            controller = str(getattr(link.adapter, "controller", ""))
+            if (first := accepting.setdefault(controller, link.name)) != link.name:
+                text = f"link {first} takes all who call {controller} already; keep one of them"
+                problems.add(("links", link.name, "accept"), text)
 
 
 def _same(option: str, a: str, b: str) -> bool:
@@ -54,8 +62,28 @@ def _same(option: str, a: str, b: str) -> bool:
         return os.path.realpath(a) == os.path.realpath(b)
     if option == "listen":
         (host_a, _, port_a), (host_b, _, port_b) = a.rpartition(":"), b.rpartition(":")
-        return port_a == port_b != "0" and (host_a == host_b or not _EVERY_INTERFACE.isdisjoint((host_a, host_b)))
+        if port_a != port_b or port_a == "0":
+            return False
+        one_family = host_a.startswith("[") == host_b.startswith("[")
+        return host_a == host_b or (one_family and not _EVERY_INTERFACE.isdisjoint((host_a, host_b)))
     return a == b
+
+
+def check_far_end(
+    adapter: Adapter, codec: PsiuHexa.Options, written: Collection[str], key: Key, problems: Problems
+) -> None:
+    """Point-to-point packets name nobody, so there must be one robot, another than the broker, to mean."""
+    if codec.topology != "point-to-point":
+        return
+    if adapter.many_peers:
+        problems.add(
+            (*key, "topology"),
+            "point-to-point packets name no robot, and this link may reach several;"
+            " choose another topology, or leave it one robot (udp: a single one of peers, and learn = false)",
+        )
+    # Where a robot's table says who is there, the same mistake is its address's.
+    if "remote" in written and codec.remote == codec.local:
+        problems.add((*key, "remote"), f"{got(codec.remote)} is the broker's own address there; give the robot's")
 
 
 def check_identities(

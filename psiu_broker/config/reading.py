@@ -5,7 +5,6 @@ protocol's codec and to the link itself, and are split among those three here.
 import re
 import tomllib
 from collections.abc import Collection, Mapping
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from pydantic import BaseModel
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config.checks import check_devices, check_identities, check_nodes, warnings_about
+from psiu_broker.config.checks import check_devices, check_far_end, check_identities, check_nodes, warnings_about
 from psiu_broker.config.problems import Key, Problems, got, guess, suggestion
 from psiu_broker.config.tables import (
     LINK_NAME,
@@ -120,6 +119,8 @@ def _link(
         if codec_model is PsiuHexa.Options:
             mine = _with_ends(name, mine, robots, own_address, problems)
         codec = problems.read(codec_model, mine, key)
+        if adapter and isinstance(codec, PsiuHexa.Options):
+            check_far_end(adapter, codec, table, key, problems)
     if adapter_model and codec_model:
         models: tuple[type[BaseModel], ...] = (adapter_model, codec_model, LinkOptions)
         known = {"adapter", "protocol"}.union(*(model.model_fields for model in models))
@@ -208,25 +209,10 @@ def _robot(
         for word in ("address", "nodes", "sensor_reply"):
             if word in table:
                 problems.add((*key, word), f"is for psiu-hexa, and link {link.name} speaks {link.protocol}; remove it")
-    peer: Peer = robot.peer
-    if robot.peer is not None and link.adapter.datagrams:
-        peer = _socket_address(robot.peer)
-        known = getattr(link.adapter, "peers", ())
-        if peer is None:
-            text = f'expected "ADDRESS:PORT", got {got(robot.peer)}; write it in numbers, like "192.168.1.20:9001"'
-            problems.add((*key, "peer"), text)
-        elif robot.peer not in known:
-            problems.add((*key, "peer"), f"{robot.peer} is not among links.{link.name}.peers; add it there")
+    peer: Peer = None
+    if robot.peer is not None:
+        try:
+            peer = link.adapter.peer_named(robot.peer)
+        except ValueError as error:
+            problems.add((*key, "peer"), str(error))
     return RobotConfiguration(name, robot.link, link.protocol, address, peer, robot.nodes, robot.sensor_reply)
-
-
-def _socket_address(text: str) -> Peer:
-    """``192.168.1.20:9001`` or ``[fe80::1]:9001`` as a socket names it; None where it is neither."""
-    host, _, port = text.rpartition(":")
-    try:
-        address = ip_address(host.removeprefix("[").removesuffix("]") if host.startswith("[") else host)
-    except ValueError:
-        return None
-    if not port.isascii() or not port.isdigit() or not 0 < int(port) <= 65535:
-        return None
-    return (str(address), int(port)) if address.version == 4 else (str(address), int(port), 0, 0)

@@ -23,6 +23,14 @@ def robot_name(name: str) -> str:
     return name
 
 
+def _broker_name(name: str) -> str:
+    if " " in name:
+        raise ValueError(
+            f"expected a name without spaces, got {got(name)}: a robot that has not met it misreads it; choose one word"
+        )
+    return robot_name(name)
+
+
 def _endpoint(endpoint: str) -> str:
     match = ENDPOINT.fullmatch(endpoint)
     if match is None or int(match["port"] or 0) > 65535:
@@ -30,7 +38,18 @@ def _endpoint(endpoint: str) -> str:
             f"expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH), got {got(endpoint)};"
             " write it like tcp/127.0.0.1:7447"
         )
+    if match["port"] and int(match["port"]) == 0:
+        raise ValueError(f"got {got(endpoint)}: port 0 is another one at each start; name one, 7447 is usual")
     return endpoint
+
+
+def _endpoints(endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    if not endpoints:
+        raise ValueError("expected at least one place, got none; leave listen out for tcp/127.0.0.1:7447")
+    for position, endpoint in enumerate(endpoints):
+        if endpoint in endpoints[:position]:
+            raise ValueError(f"{got(endpoint)} is there twice; remove one")
+    return endpoints
 
 
 def _prefix(prefix: str) -> str:
@@ -44,8 +63,11 @@ ENDPOINT: Final = re.compile(
     r"(?:tcp|udp|ws)/(?P<host>\[[^\s\[\]]+\]|[^\s:/\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?|unixsock-stream/\S+"
 )
 
-RobotName = Annotated[str, AfterValidator(robot_name)]
+BrokerName = Annotated[str, AfterValidator(_broker_name)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Endpoints = Annotated[
+    tuple[Endpoint, ...], AfterValidator(_endpoints), Field(json_schema_extra={"minItems": 1, "uniqueItems": True})
+]
 Prefix = Annotated[str, AfterValidator(_prefix)]
 Number = Annotated[int, Field(ge=0, le=255)]
 SensorReply = Literal["node-0", "bit7"]
@@ -59,14 +81,14 @@ class _Table(BaseModel):
 class BrokerConfiguration(_Table):
     """``[broker]``: who the broker is to robots, whose protocols it speaks as one of them."""
 
-    name: RobotName = Field(description="the broker's own name among the robots")
+    name: BrokerName = Field(description="the broker's own name among the robots")
     address: Number = Field(0, description="the broker's own PSIU HEXA address")
 
 
 class ZenohConfiguration(_Table):
     """``[zenoh]``: where other programs find the broker."""
 
-    listen: tuple[Endpoint, ...] = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
+    listen: Endpoints = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
     prefix: Prefix = Field("psiu", description="the first part of every key")
 
 
