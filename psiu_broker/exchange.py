@@ -285,12 +285,14 @@ class Exchange:
         return None
 
     def _ask_names(self, robot: Address, hops: tuple[Way, ...], now: float) -> None:
+        if not hops:
+            return
         frame = psiu_ascii.message(self._own_name, robot, "qualseunome")
         self.resident.asked_names(hops, now)
         account = self.accounts[SELF.link]
         account.arrived += 1
         if self.bus.listened:
             self.bus.publish(self._written(frame, hops), SELF, self._wall_clock())
-        verdict = self._spread(frame, hops, SELF, now) if hops else NO_ROUTE
+        verdict = self._spread(frame, hops, SELF, now)
         if verdict is not None:
             account.fates[verdict] += 1
