@@ -1,13 +1,16 @@
 """What is installed beside the package, checked by the tools of those who read it."""
 
+import os
 import re
 import shutil
+import stat
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from psiu_broker import __version__
+from psiu_broker.bus.session import Session
 from psiu_broker.config import load
 
 TREE = Path(__file__).parents[1]
@@ -53,6 +56,29 @@ def test_the_unit_is_hardened():
 def test_a_wrong_configuration_is_not_tried_again_and_anything_else_is_for_ever():
     unit = SERVICE.read_text().splitlines()
     assert {"Type=notify", "Restart=on-failure", "RestartPreventExitStatus=78", "StartLimitIntervalSec=0"} <= set(unit)
+
+
+async def test_the_group_of_the_service_and_nobody_else_reaches_the_socket_that_the_guide_tells_of(tmp_path):
+    unit = dict(line.split("=", 1) for line in SERVICE.read_text().splitlines() if re.match(r"\w+=", line))
+    (endpoint,) = set(re.findall(r"unixsock-stream/[^\s\"]+", (DEPLOY / "README.md").read_text() + SERVICE.read_text()))
+    path = Path(endpoint.removeprefix("unixsock-stream/"))
+    assert path.parent == Path("/run") / unit["RuntimeDirectory"]
+    assert unit["RuntimeDirectoryMode"] == "0750"
+    made = tmp_path / path.name
+    before = os.umask(int(unit["UMask"], 8))
+    try:
+        session = await Session.open([f"unixsock-stream/{made}"])
+        mode = stat.S_IMODE(made.stat().st_mode)
+        await session.close()
+    finally:
+        os.umask(before)
+    assert f"{mode:o}" == "770"
+
+
+def test_the_example_may_listen_there(tmp_path):
+    file = tmp_path / "psiu-broker.toml"
+    file.write_text(EXAMPLE.read_text().replace("tcp/127.0.0.1:7447", "unixsock-stream//run/psiu-broker/psiu.sock"))
+    assert load(file).warnings == ()
 
 
 @pytest.mark.skipif(SYSTEMD_SYSUSERS is None, reason="systemd-sysusers is missing: the user is NOT made")
