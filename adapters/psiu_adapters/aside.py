@@ -33,7 +33,7 @@ class Aside:
         # From now on a cancellation reaches the waiting only, not the work.
         begun.set_running_or_notify_cancel()
         self._last = begun
-        threading.Thread(target=_carry_out, args=(work, begun), name=self._name, daemon=True).start()
+        threading.Thread(target=_carry_out, args=(work, begun), name=f"aside: {self._name}", daemon=True).start()
         try:
             return await asyncio.wrap_future(begun)
         except asyncio.CancelledError:

@@ -221,7 +221,7 @@ class AdapterContract:
         assert recorder.losses == []
 
     async def test_an_opening_that_is_cancelled_leaves_no_descriptor(self, far: FarEnd, recorder: Recorder) -> None:
-        before = open_descriptors()
+        before = held()
         for turns in range(6):
             opening = asyncio.create_task(far.adapter.open(recorder))
             for _ in range(turns):
@@ -231,7 +231,7 @@ class AdapterContract:
             result = (await asyncio.gather(opening, return_exceptions=True))[0]
             if isinstance(result, Transport):
                 await result.close()
-            await descriptors_become(before)
+            await no_more_than(before)
 
     async def test_waiting_for_a_change_leaves_nothing_when_it_is_cancelled(self, far: FarEnd) -> None:
         await self._wait_a_little(far)
@@ -247,12 +247,12 @@ class AdapterContract:
                 await far.adapter.changed()
 
     async def test_an_absent_far_end_is_a_link_error_in_one_line(self, absent: Adapter, recorder: Recorder) -> None:
-        before = open_descriptors()
+        before = held()
         with pytest.raises(LinkError) as raised:
             await absent.open(recorder)
         assert str(raised.value)
         assert "\n" not in str(raised.value)
-        await descriptors_become(before)
+        await no_more_than(before)
 
     async def test_the_options_are_frozen_and_unknown_ones_refused(self, far: FarEnd) -> None:
         options = far.adapter.model_dump()
@@ -270,10 +270,13 @@ def open_descriptors() -> set[str]:
     return {name for name in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{name}")}  # noqa: PTH110, PTH208
 
 
-async def descriptors_become(expected: set[str]) -> None:
-    """Wait until exactly `expected` are open and no thread is left that may still open or close what was abandoned."""
+def held() -> set[str]:
+    """What this process holds: open descriptors, and threads that may still open or close what was abandoned."""
+    return open_descriptors() | {f"thread {thread.ident}" for thread in threading.enumerate() if thread.daemon}
+
+
+async def no_more_than(expected: set[str]) -> None:
+    """Wait until nothing is `held` beyond `expected`."""
     async with asyncio.timeout(PATIENCE_S):
-        while (  # noqa: ASYNC110 — the thread tells nobody
-            open_descriptors() != expected or any(thread.daemon for thread in threading.enumerate())
-        ):
+        while not held() <= expected:  # noqa: ASYNC110 - the thread tells nobody
             await asyncio.sleep(0.01)
