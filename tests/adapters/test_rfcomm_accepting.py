@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from adapter_contract import PATIENCE_S, AdapterContract, FarEnd, Recorder, descriptors_become, open_descriptors
+from adapter_contract import PATIENCE_S, AdapterContract, FarEnd, Recorder, held, no_more_than
 from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, Ends, Robot, mocked, needs_mock, opened
 
 from psiu_adapters.rfcomm import Rfcomm
@@ -68,7 +68,7 @@ async def test_a_phone_that_calls_again_replaces_its_dead_call(bluetooth: Blueto
 
 async def test_nobody_may_call_when_no_link_accepts(bluetooth: Bluetooth) -> None:
     await bluetooth.start(known=BOTH)
-    before = open_descriptors()
+    before = held()
     async with (
         bluetooth.robot(ROBOT),
         bluetooth.robot(OTHER) as phone,
@@ -80,7 +80,7 @@ async def test_nobody_may_call_when_no_link_accepts(bluetooth: Bluetooth) -> Non
         assert await bluetooth.steer("Call", "sb", OTHER, True) == "rejected"
         reader, _ = await phone.joined()
         assert await reader.read() == b""
-    await descriptors_become(before)
+    await no_more_than(before)
 
 
 async def test_bluetoothd_stopping_is_told_to_a_link_that_accepts(bluetooth: Bluetooth) -> None:

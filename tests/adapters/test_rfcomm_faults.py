@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
-from adapter_contract import PATIENCE_S, Recorder, descriptors_become, open_descriptors
+from adapter_contract import PATIENCE_S, Recorder, held, no_more_than
 from dbus_fast import Message, Variant
 from mocked_bluez import BOTH, OTHER, PAIRED, ROBOT, Bluetooth, mocked, needs_mock, opened
 
@@ -208,7 +208,7 @@ async def test_a_hanging_bluetoothd_ends_in_a_refusal_and_not_in_a_hang(
 
 async def test_connecting_can_be_cancelled_and_leaves_nothing_behind(bluetooth: Bluetooth) -> None:
     await bluetooth.start(known=PAIRED)
-    before = open_descriptors()
+    before = held()
     for wait_s in (0, 0.001, 0.005, 0.02, 0.05):
         async with bluetooth.robot():
             opening = asyncio.ensure_future(Rfcomm(address=ROBOT).open(Recorder()))
@@ -217,12 +217,12 @@ async def test_connecting_can_be_cancelled_and_leaves_nothing_behind(bluetooth: 
             (done,), _ = await asyncio.wait({opening})
             if not done.cancelled():
                 await done.result().close()
-    await descriptors_become(before)
+    await no_more_than(before)
 
 
 async def test_no_descriptor_leaks_over_connections_and_failures(bluetooth: Bluetooth) -> None:
     await bluetooth.start(known=PAIRED)
-    before = open_descriptors()
+    before = held()
     for _ in range(3):
         async with bluetooth.robot() as robot, opened(Rfcomm(address=ROBOT), Recorder()):
             _, writer = await robot.joined()
@@ -230,7 +230,7 @@ async def test_no_descriptor_leaks_over_connections_and_failures(bluetooth: Blue
             await writer.wait_closed()
         with pytest.raises(LinkAbsent):
             await Rfcomm(address=ROBOT).open(Recorder())
-    await descriptors_become(before)
+    await no_more_than(before)
 
 
 async def test_another_program_with_the_profile_is_named(bluetooth: Bluetooth) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from adapter_contract import PATIENCE_S, Recorder, descriptors_become, open_descriptors
+from adapter_contract import PATIENCE_S, Recorder, held, no_more_than
 from pty_robot import Pty
 from pydantic import ValidationError
 
@@ -90,10 +90,10 @@ class TestOpening:
         self, pty: Pty, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("psiu_adapters.serial._actual_baudrate", lambda _: 38400)
-        before = open_descriptors()
+        before = held()
         with pytest.raises(LinkError, match=r"its driver refuses 9600 baud \(it set 38400\)$"):
             await pty.adapter.open(recorder)
-        assert open_descriptors() == before
+        assert held() == before
 
     def test_a_rate_that_the_driver_rejects_is_named(self) -> None:
         error = ValueError("Failed to set custom baud rate (2000): [Errno 22] Invalid argument")
@@ -141,15 +141,15 @@ class TestOpening:
         self, tmp_path: Path, recorder: Recorder
     ) -> None:
         far = Pty(tmp_path / "board", open_delay_s=60)
-        before = open_descriptors()
+        before = held()
         opening = asyncio.create_task(far.adapter.open(recorder))
         async with asyncio.timeout(PATIENCE_S):
-            while open_descriptors() == before:  # noqa: ASYNC110 — a thread opens it
+            while held() == before:  # noqa: ASYNC110 — a thread opens it
                 await asyncio.sleep(0.01)
         opening.cancel()
         with pytest.raises(asyncio.CancelledError):
             await opening
-        await descriptors_become(before)
+        await no_more_than(before)
         far.unplug()
 
     @pytest.mark.parametrize(
