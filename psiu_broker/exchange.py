@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from math import inf
 from typing import Literal, Protocol, cast
@@ -119,12 +120,15 @@ class Exchange:
         bus = self.bus
         decision = self._route(frame, way, now)
         hops = decision.hops
-        if bus.listened and decision is not DOUBLE and decision is not IMPOSSIBLE_SOURCE:
-            bus.publish(frame if frame.wire else self._written(frame, hops), way, self._wall_clock())
         if decision.action == "forward" and len(hops) == 1:
             link, peer = hops[0]
             verdict = self.links[link].offer(frame, peer, way, now, patience_s)
+            if bus.listened:
+                self._publish(frame, hops, way)
         else:
+            # Before it is carried out: listeners hear a question before our answer to it.
+            if bus.listened and decision is not DOUBLE and decision is not IMPOSSIBLE_SOURCE:
+                self._publish(frame, hops, way)
             verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
             account.fates[verdict] += 1
@@ -264,14 +268,12 @@ class Exchange:
                 final = fate.settle(verdict)
         return final
 
-    def _written(self, frame: Frame, hops: tuple[Way, ...]) -> Frame:
-        """`frame`, which is our own, with the bytes that its first hop will carry."""
-        for hop in hops:
-            try:
-                return frame._replace(wire=self.links[hop.link].codec.encode(frame))
-            except EncodeError:
-                break
-        return frame
+    def _publish(self, frame: Frame, hops: tuple[Way, ...], way: Way) -> None:
+        """Tell the bus of `frame`; of our own with the bytes that its first hop carries."""
+        if not frame.wire and hops:
+            with suppress(EncodeError):
+                frame = frame._replace(wire=self.links[hops[0].link].codec.encode(frame))
+        self.bus.publish(frame, way, self._wall_clock())
 
     def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
         """Hold a frame for an unknown robot, and ask for the robot by its name, once."""
@@ -292,7 +294,7 @@ class Exchange:
         account = self.accounts[SELF.link]
         account.arrived += 1
         if self.bus.listened:
-            self.bus.publish(self._written(frame, hops), SELF, self._wall_clock())
+            self._publish(frame, hops, SELF)
         verdict = self._spread(frame, hops, SELF, now)
         if verdict is not None:
             account.fates[verdict] += 1
