@@ -99,8 +99,10 @@ class World:
         self._add("arm", MemoryAdapter(), "psiu-hexa", topology="point-to-point", remote=0x12, local=0)
         self.transports: dict[str, MemoryTransport] = {}
 
-    def _add(self, name: str, adapter: MemoryAdapter, protocol: str = "psiu-ascii", **codec: object) -> None:
-        made = configuration(name, protocol, adapter, codec, queue_frames=3, max_age_s=2.0, route_age_s=30.0)
+    def _add(
+        self, name: str, adapter: MemoryAdapter, protocol: str = "psiu-ascii", max_age_s: float = 2.0, **codec: object
+    ) -> None:
+        made = configuration(name, protocol, adapter, codec, queue_frames=3, max_age_s=max_age_s, route_age_s=30.0)
         unaddressed = "topology" in codec
         self.links[name] = QuietLink(
             made, lambda: codec_of(made), self.exchange, unaddressed=unaddressed, clock=lambda: self.now
@@ -202,6 +204,18 @@ def test_the_time_spent_waiting_for_a_route_counts_towards_the_age_limit(world: 
     assert world.wires("second") == []
     assert world.verdicts("wifi") == {"expired": 1}
     world.balances()
+
+
+def test_a_frame_older_than_its_link_allows_is_not_sent_even_if_the_wire_is_free() -> None:
+    world = World()
+    world._add("hasty", MemoryAdapter(), max_age_s=0.1)
+    world.connect("wifi", "hasty")
+    command = wire("PC", "MNERIM", "parafrente", "100")
+    world.links["wifi"].received(command, PEERS[0])
+    world.now += 0.4
+    world.links["hasty"].received(wire("MNERIM", "base", "qualseunome"), None)
+    assert command not in world.wires("hasty")
+    assert world.verdicts("wifi") == {"expired": 1}
 
 
 def test_a_callers_patience_holds_on_every_way_to_a_robot_that_is_sought(world: World) -> None:
