@@ -143,7 +143,7 @@ class Route(Message):
     robot: str
     link: str
     peer: str | None = None
-    origin: Literal["learned", "static"]
+    origin: Literal["learned", "static", "mesh"] = Field(description="mesh: told by the broker that has the robot")
     age_s: float | None = Field(
         default=None, description="since its last checked frame; null for a static route never heard"
     )
@@ -201,6 +201,84 @@ class Why(Message):
     delivered: bool
     verdict: str
     steps: list[str] = Field(description="the decision, one sentence a step")
+    broker: str = Field(default="", description="who says this")
+    via: str | None = Field(default=None, description="the broker that the frame is handed to next; null: to none")
+    link: str | None = Field(default=None, description="what the frame leaves on; null: on none, or on several")
+    age_s: float | None = Field(default=None, description="since b was last heard, as far as this broker knows")
+    filter: str | None = Field(default=None, description="what could stop the frame here, or did")
+    cost_ms: float | None = Field(default=None, description="what waits for the link now and the frame, on the wire")
+
+
+class MeshBroker(Message):
+    """Another broker, as one broker sees it."""
+
+    name: str
+    zenoh_id: str
+    since: Moment = Field(description="when it was first seen in this life of its own")
+    rtt_ms: float | None = Field(default=None, description="there and back; null: not measured yet")
+    silent_s: float | None = Field(default=None, description="since its last beat; null: none came yet")
+    frames_in: int = 0
+    frames_out: int = 0
+    lost: int = Field(default=0, description="frames that it sent us and that never came")
+    robots: int = Field(default=0, description="how many it owns")
+    linked: bool = Field(default=False, description="whether Zenoh has a direct link to it; false: others relay")
+
+
+class MeshRobot(Message):
+    """A robot that a broker announces to the others."""
+
+    robot: str
+    address: str | None = Field(default=None, description="its PSIU HEXA address, where it has one")
+    protocol: str
+    owner: str = Field(description="the broker that publishes what it says and takes its calls")
+    link: str
+    quality: float = Field(description="how well it is heard there, 0–1")
+    age_s: float | None = Field(default=None, description="since it was last heard; null: never")
+    term: int = Field(description="grows with each change of owner; the highest is the owner's")
+
+
+class Conflict(Message):
+    """One name that more than one robot seems to have."""
+
+    robot: str
+    brokers: list[str]
+    since: Moment
+    detail: str
+
+
+class Mesh(Message):
+    """The brokers and their robots as one broker sees them: ``psiu/@broker/{broker}/mesh``."""
+
+    broker: str
+    mode: Literal["peer", "router"]
+    zenoh_id: str
+    brokers: list[MeshBroker] = Field(default=[], description="the others")
+    robots: list[MeshRobot] = Field(default=[], description="all that are announced, its own among them")
+    conflicts: list[Conflict] = []
+    redeclared: int = Field(default=0, description="how often it announced everything again, to mend Zenoh's routes")
+
+
+class TraceHop(Message):
+    """Where a question was, and when."""
+
+    at: str = Field(description="a broker, a broker's link such as base/radio, or the robot")
+    event: Literal["sent", "routed", "received", "written", "answered"]
+    elapsed_ms: float = Field(description="since the question left")
+
+
+class Trace(Message):
+    """How a harmless question went from `a` to `b`: ``psiu/@broker/{broker}/trace/{a}/{b}``.
+
+    Only the broker that has `a`, or is `a`, answers.
+    """
+
+    a: str
+    b: str
+    question: str
+    answered: bool
+    reason: str | None = Field(default=None, description="why there was no answer")
+    hops: list[TraceHop] = []
+    total_ms: float
 
 
 PUBLISHED: Final[tuple[type[Message], ...]] = (
@@ -216,5 +294,7 @@ PUBLISHED: Final[tuple[type[Message], ...]] = (
     Status,
     Health,
     Why,
+    Mesh,
+    Trace,
 )
 """The messages of the bus, in the order in which `psiu schema` prints them."""
