@@ -202,7 +202,14 @@ class Why(Message):
     verdict: str
     steps: list[str] = Field(description="the decision, one sentence a step")
     broker: str = Field(default="", description="who says this")
-    via: str | None = Field(default=None, description="the broker that the frame is handed to next; null: to none")
+    entry: str | None = Field(
+        default=None,
+        description="what a's frames come in on: a link, @self for the broker itself, @mesh from another broker;"
+        " null: a is not known here",
+    )
+    via: str | None = Field(
+        default=None, description="the broker that the frame is handed to next; null: to none; *: to several"
+    )
     link: str | None = Field(default=None, description="what the frame leaves on; null: on none, or on several")
     age_s: float | None = Field(default=None, description="since b was last heard, as far as this broker knows")
     filter: str | None = Field(default=None, description="what could stop the frame here, or did")
