@@ -81,15 +81,16 @@ class Session:
         cls,
         listen: Sequence[str],
         *,
+        connect: Sequence[str] = (),
         lost: Callable[[BusError], None] = lambda error: None,
     ) -> "Session":
-        """Listen at `listen`.
+        """Listen at `listen`, and connect to each of `connect`, whenever somebody is there.
 
         Raises:
             BusError: an endpoint is taken, impossible or misspelt.
         """
         try:
-            config = zenoh.Config.from_json5(json.dumps(_configuration(listen)))
+            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect)))
             session = await aside(zenoh.open, config)
         except Exception as error:
             raise BusError(_open_problem(error)) from error
@@ -166,10 +167,16 @@ def _is_panic(error: BaseException) -> bool:
     return type(error).__name__ == "PanicException"
 
 
-def _configuration(listen: Sequence[str]) -> dict[str, object]:
+def _configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, object]:
     return {
         "mode": "peer",
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": -1,  # 0 would mean: never again, where nobody was there at first
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2},
+        },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},

@@ -35,6 +35,22 @@ async def test_an_impossible_endpoint_is_one_line_without_places_in_zenohs_sourc
     assert "\n" not in str(raised.value)
 
 
+async def test_a_broker_that_is_not_there_yet_is_met_when_it_comes_and_when_it_returns(
+    endpoint: str, until: Callable[[Callable[[], object]], Awaitable[None]]
+) -> None:
+    early = await Session.open([], connect=[endpoint])
+    try:
+        for _ in range(2):
+            late = await Session.open([endpoint])
+            try:
+                await until(lambda: [str(peer) for peer in early.zenoh.info.peers_zid()] == [late.zenoh_id])  # noqa: B023
+            finally:
+                await late.close()
+            await until(lambda: not early.zenoh.info.peers_zid())
+    finally:
+        await early.close()
+
+
 async def test_closing_ends_every_thread_frees_the_port_and_is_harmless_twice(
     endpoint: str, keys: Keys, until: Callable[[Callable[[], object]], Awaitable[None]]
 ) -> None:
