@@ -1,0 +1,97 @@
+"""One frame on its way from broker to broker, as bytes.
+
+What the robot said travels, not its wire: the codec of the last link writes the frame anew, so
+that no broker can put bytes on another's radio that are no frame.
+"""
+
+import struct
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
+
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.errors import EncodeError
+from psiu_broker.frame import Address, Frame
+
+VERSION: Final = 1
+LONGEST: Final = 65_535
+
+_HEADER: Final = struct.Struct(">BQQQIhhH")
+_MARK: Final = "\0"
+
+
+class Envelope(NamedTuple):
+    """A frame, and what the receiving broker must know of its way."""
+
+    epoch: int
+    """Which life of the sending broker this is: a random 64-bit number."""
+    sequence: int
+    """The place in the series from this broker to the receiver, of one lane, in this life; counts from 1."""
+    sent_us: int
+    """What the sender's steady clock read, in microseconds."""
+    age_ms: int
+    """How long the frame had waited at the sender."""
+    frame: Frame
+
+
+def pack(envelope: Envelope) -> bytes:
+    """The bytes of `envelope`.
+
+    Raises:
+        EncodeError: a name that cannot be carried, or too much of it all.
+    """
+    frame = envelope.frame
+    source, destination = frame.source, frame.destination
+    texts = (frame.protocol, source.name, source.domain, destination.name, destination.domain)
+    if any(_MARK in text for text in texts):
+        raise EncodeError("a name with a NUL in it cannot be sent to another broker")
+    words = _MARK.join(texts).encode("utf-8", "surrogatepass")
+    if len(words) + len(frame.payload) > LONGEST:
+        raise EncodeError(f"a frame of {len(frame.payload)} bytes is too long for another broker")
+    header = _HEADER.pack(
+        VERSION,
+        envelope.epoch,
+        envelope.sequence,
+        envelope.sent_us,
+        min(max(envelope.age_ms, 0), 0xFFFFFFFF),
+        source.number,
+        destination.number,
+        len(words),
+    )
+    return header + words + frame.payload
+
+
+def unpack(data: bytes) -> Envelope | None:
+    """What `pack` made; None for anything else. Never raises."""
+    if len(data) < _HEADER.size or data[0] != VERSION:
+        return None
+    _, epoch, sequence, sent_us, age_ms, source, destination, length = _HEADER.unpack_from(data)
+    start = _HEADER.size + length
+    try:
+        protocol, source_name, source_domain, name, domain = (
+            data[_HEADER.size : start].decode("utf-8").split(_MARK)
+        )
+        make = _MAKERS[protocol]
+    except (ValueError, KeyError):
+        return None
+    if len(data) < start or not (_is_address(source_name, source) and _is_address(name, destination)):
+        return None
+    frame = make(Address(source_name, source, source_domain), Address(name, destination, domain), data[start:])
+    return None if frame is None else Envelope(epoch, sequence, sent_us, age_ms, frame)
+
+
+def _is_address(name: str, number: int) -> bool:
+    """A name or a number, not both; neither is the source of a protocol that names none."""
+    return number == -1 if name else -1 <= number <= 255
+
+
+def _ascii(source: Address, destination: Address, payload: bytes) -> Frame | None:
+    try:
+        return psiu_ascii.message(source, destination, *payload.decode("ascii").split(" "))
+    except UnicodeDecodeError:
+        return None
+
+
+_MAKERS: Final[Mapping[str, Callable[[Address, Address, bytes], Frame | None]]] = {
+    "psiu-ascii": _ascii,
+    "psiu-hexa": psiu_hexa.packet,
+}

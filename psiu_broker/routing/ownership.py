@@ -1,0 +1,191 @@
+"""One owner for each robot, however many brokers hear it.
+
+The owner publishes what the robot says, carries out its calls and sends to it. A broker that hears
+a robot that another one owns tells the owner so, with the frame itself (a *notice*). If the owner
+heard that very frame, both hear one radio: it stays the owner unless the other hears clearly
+better for a while. If it did not, the robot has moved, and the owner gives it up. Should the robot
+be heard again by the owner before it could, there is more than one robot of that name: after a few
+such alternations this is a conflict, which is shown, and the owner stays who it is.
+
+Pure: told the time. It decides; `psiu_broker.mesh` does.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.routing.claims import Claims
+from psiu_broker.routing.table import Route
+
+NOTICE_EVERY_S: Final = 0.2
+SETTLED_S: Final = 0.3
+"""How long the owner waits for its own copy of a frame that another broker heard."""
+BETTER_BY: Final = 2
+BETTER_FOR_S: Final = 3.0
+"""A robot on one radio with two brokers changes hands when the other hears better by 2 tenths for this long."""
+RECENT_S: Final = 10.0
+"""A robot overheard this recently is taken over when nobody owns it any more."""
+ALTERNATIONS: Final = 3
+ALTERNATIONS_WITHIN_S: Final = 60.0
+CONFLICT_KEPT_S: Final = 60.0
+OVERHEARD_MAX: Final = 4096
+
+
+@dataclass(slots=True)
+class Overheard:
+    """The last that we heard of a robot that another broker owns."""
+
+    way: Way
+    protocol: str
+    at: float
+    noticed_at: float
+
+
+@dataclass(slots=True)
+class _Rival:
+    """What the owner knows of another broker that hears one of its robots."""
+
+    asked_at: float | None = None
+    """When the notice came that is not settled yet."""
+    key: object = None
+    strange_at: float | None = None
+    """When it last heard the robot where we did not."""
+    better_since: float | None = None
+    alternations: deque[float] = field(default_factory=lambda: deque(maxlen=ALTERNATIONS))
+
+
+@dataclass(slots=True)
+class Conflict:
+    """Robots of one name that are alive at several brokers."""
+
+    robot: Address
+    brokers: set[str]
+    since: float
+    last: float
+
+
+class Ownership:
+    """What one broker knows of who owns what.
+
+    Args:
+        own: this broker's name.
+        alive: whether another broker was heard a moment ago.
+        heard_here: whether one of our own links brought the frame with that identity.
+        notify: called with the owner, the frame that we heard of its robot, and where.
+    """
+
+    def __init__(
+        self,
+        own: str,
+        alive: Callable[[str, float], bool],
+        heard_here: Callable[[object], bool],
+        notify: Callable[[str, Frame, Way], None],
+    ) -> None:
+        self.claims = Claims()
+        self.overheard: dict[Address, Overheard] = {}
+        self.conflicts: dict[Address, Conflict] = {}
+        self._own = own
+        self._alive = alive
+        self._heard_here = heard_here
+        self._notify = notify
+        self._rivals: dict[tuple[Address, str], _Rival] = {}
+
+    def owner(self, robot: Address) -> str | None:
+        held = self.claims.owner(robot)
+        return None if held is None else held[0]
+
+    def takes(self, route: Route, frame: Frame, arrived: Way, now: float) -> bool:
+        """A robot that lives at another broker was heard on a link of ours: whether it is ours now."""
+        robot = route.robot
+        owner = self.owner(robot)
+        if owner == route.way.peer and str(robot) == owner:
+            return False  # a robot cannot be a broker
+        if owner is None or owner == self._own or not self._alive(owner, now):
+            self.overheard.pop(robot, None)
+            return True
+        self.overhear(route, frame, arrived, now)
+        return False
+
+    def overhear(self, route: Route, frame: Frame, arrived: Way, now: float) -> None:
+        """Note what was heard of a robot of another broker, and tell its owner now and then."""
+        robot = route.robot
+        owner = self.owner(robot)
+        known = self.overheard.pop(robot, None)
+        noticed_at = known.noticed_at if known is not None else now - NOTICE_EVERY_S
+        if owner is not None and now - noticed_at >= NOTICE_EVERY_S:
+            noticed_at = now
+            self._notify(owner, frame, arrived)
+        self.overheard[robot] = Overheard(arrived, frame.protocol, now, noticed_at)
+        if len(self.overheard) > OVERHEARD_MAX:
+            del self.overheard[next(iter(self.overheard))]
+
+    def heard_on(self, robot: Address, now: float) -> str | None:
+        """The link of ours on which a robot of another broker was overheard of late."""
+        known = self.overheard.get(robot)
+        return known.way.link if known is not None and now - known.at <= RECENT_S else None
+
+    def recent(self, robot: Address, now: float) -> Overheard | None:
+        """What was overheard of a robot, if that is recent enough to take it over."""
+        known = self.overheard.get(robot)
+        return known if known is not None and now - known.at <= RECENT_S else None
+
+    def noticed(self, route: Route, broker: str, key: object, better_by: int, now: float) -> bool:
+        """Another broker heard the frame `key` of a robot that we own, `better_by` tenths better: whether to yield."""
+        rival = self._rivals.setdefault((route.robot, broker), _Rival())
+        if self._heard_here(key):
+            return self._shared(route.robot, rival, better_by, now)
+        if rival.asked_at is None:
+            rival.asked_at, rival.key = now, key
+        heard_between = route.heard_at is not None and rival.strange_at is not None and route.heard_at > rival.strange_at
+        if heard_between or rival.strange_at is None:
+            self._alternated(route, broker, rival, now)
+        rival.strange_at = now
+        return False
+
+    def due(self, find: Callable[[Address], Route | None], now: float) -> Iterator[tuple[Address, str]]:
+        """The robots that have moved to another broker, as far as it can be told by now."""
+        for (robot, broker), rival in list(self._rivals.items()):
+            if rival.asked_at is None or now - rival.asked_at < SETTLED_S:
+                continue
+            asked_at, rival.asked_at = rival.asked_at, None
+            route = find(robot)
+            if route is None or self._heard_here(rival.key) or robot in self.conflicts:
+                continue
+            if route.heard_at is None or route.heard_at <= asked_at:
+                yield robot, broker
+
+    def expire(self, now: float) -> None:
+        """Forget what is long past."""
+        for key, rival in list(self._rivals.items()):
+            if rival.strange_at is None or now - rival.strange_at > ALTERNATIONS_WITHIN_S:
+                if rival.better_since is None and rival.asked_at is None:
+                    del self._rivals[key]
+        for robot, conflict in list(self.conflicts.items()):
+            if now - conflict.last > CONFLICT_KEPT_S:
+                del self.conflicts[robot]
+
+    def _shared(self, robot: Address, rival: _Rival, better_by: int, now: float) -> bool:
+        """Both of us heard the same frame."""
+        rival.asked_at = None
+        rival.alternations.clear()
+        if better_by < BETTER_BY or robot in self.conflicts:
+            rival.better_since = None
+        elif rival.better_since is None:
+            rival.better_since = now
+        elif now - rival.better_since >= BETTER_FOR_S:
+            rival.better_since = None
+            return True
+        return False
+
+    def _alternated(self, route: Route, broker: str, rival: _Rival, now: float) -> None:
+        """The robot is heard there after it was heard here."""
+        robot = route.robot
+        rival.alternations.append(now)
+        conflict = self.conflicts.get(robot)
+        if conflict is not None:
+            conflict.brokers.add(broker)
+            conflict.last = now
+        elif len(rival.alternations) == ALTERNATIONS and now - rival.alternations[0] <= ALTERNATIONS_WITHIN_S:
+            self.conflicts[robot] = Conflict(robot, {self._own, broker}, now, now)
