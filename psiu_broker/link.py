@@ -5,30 +5,23 @@ A link is an adapter, a codec and an outbox, kept alive by `Link.run`. Between `
 """
 
 import asyncio
-import contextlib
 import logging
-import random
 import time
 from collections.abc import Callable, Sequence
 from math import inf
-from typing import Final, Literal, Protocol
+from typing import ClassVar, Final, Protocol
 
 from psiu_broker.adapter import Peer, Transport
 from psiu_broker.codecs.avr import avr_trouble
 from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration
-from psiu_broker.errors import EncodeError, LinkError
+from psiu_broker.errors import EncodeError
 from psiu_broker.frame import Address, Frame, Malformed, Way
+from psiu_broker.kept import FIRST_PAUSE_S, Kept
 from psiu_broker.routing.askers import Askers
 from psiu_broker.routing.outbox import Fate, Outbox, Parcel, lane
 from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, Verdict
 
-State = Literal["waiting", "opening", "open", "closed"]
-
-FIRST_PAUSE_S: Final = 0.25
-LONGEST_PAUSE_S: Final = 15.0
-SHORTEST_PAUSE_S: Final = 0.05
-"""Between two attempts, whatever the adapter says has changed."""
 WARNED_KEPT: Final = 256
 
 log = logging.getLogger(__name__)
@@ -67,8 +60,10 @@ class _End:
         self.timer: asyncio.TimerHandle | None = None
 
 
-class Link:
+class Link(Kept):
     """A link that keeps itself alive and never lets its trouble out."""
+
+    kind: ClassVar[str] = "link"
 
     def __init__(
         self,
@@ -79,16 +74,10 @@ class Link:
         unaddressed: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.name = configuration.name
-        self.adapter = configuration.adapter
+        super().__init__(configuration.name, configuration.adapter, clock)
         self.configuration = configuration
         self.codec = codec()
         """Encodes what leaves; decodes too where each datagram stands alone."""
-        self.state: State = "waiting"
-        self.reason: str | None = "not opened yet"
-        """What it waits for, in words; None while it is open."""
-        self.since = clock()
-        self._told: tuple[State, str | None] = (self.state, self.reason)
         self.frames_in = self.frames_out = self.malformed = self.opened = 0
         self.last_heard: float | None = None
         self.last_sent = -inf
@@ -99,12 +88,8 @@ class Link:
         self._warned: set[Address] = set()
         self._avr_limits = configuration.options.avr_limits
         self._max_age_s = configuration.options.max_age_s
-        self._clock = clock
-        self._transport: Transport | None = None
         self._ends: dict[Peer, _End] = {}
-        self._lost: asyncio.Future[LinkError] | None = None
         self._empty: asyncio.Event = asyncio.Event()
-        self.pause_s = FIRST_PAUSE_S
 
     # What the transport tells us: adapter.Receiver.
 
@@ -147,11 +132,6 @@ class Link:
             if end.timer is not None:
                 end.timer.cancel()
             self._hub.peer_lost(end.way, now)
-
-    def lost(self, error: LinkError) -> None:
-        if self._lost is not None and not self._lost.done():
-            self._lost.set_result(error)
-        self._down(str(error))
 
     def connected(self, transport: Transport) -> None:
         """The adapter has opened `transport`: frames may go."""
@@ -211,41 +191,6 @@ class Link:
 
     def details(self) -> dict[str, str | int | float]:
         return {} if self._transport is None else dict(self._transport.status())
-
-    async def run(self) -> None:
-        """Keep the link open for ever: what fails waits and is tried again. Ends only when cancelled."""
-        try:
-            while True:
-                try:
-                    await self._live()
-                except LinkError as error:
-                    self._set_state("waiting", str(error))
-                except Exception as error:  # an adapter's own mistake must not reach another link
-                    log.exception("link %s: its adapter failed", self.name)
-                    self._set_state("waiting", f"its adapter failed: {error!r}")
-                await self._pause()
-        finally:
-            self._set_state("closed", None)
-
-    async def _live(self) -> None:
-        """Open the link once, and serve it until it is lost.
-
-        Raises:
-            LinkError: it cannot be opened, or was lost; the text says why.
-        """
-        self._lost = asyncio.get_running_loop().create_future()
-        self._set_state("opening", self.reason)
-        transport = await self.adapter.open(self)
-        try:
-            if not self._lost.done():
-                self.connected(transport)
-            raise await self._lost
-        finally:
-            self._down("closed")
-            try:
-                await transport.close()
-            except Exception:  # it must not hide why the link ends, least of all that it was told to
-                log.exception("link %s: its adapter failed to close", self.name)
 
     async def drained(self) -> None:
         """Return when nothing waits to be sent."""
@@ -333,27 +278,3 @@ class Link:
             self._hub.settled(parcel.fate, LINK_DOWN, now)
         self._empty.set()
         self._hub.closed(self, now)
-
-    async def _pause(self) -> None:
-        """Wait before the next attempt: less when the adapter sees something change, longer each time in vain."""
-        pause_s = self.pause_s * random.uniform(0.5, 1.0)  # noqa: S311 - jitter is no secret
-        self.pause_s = min(self.pause_s * 2, LONGEST_PAUSE_S)
-        changed = asyncio.ensure_future(self.adapter.changed())
-        try:
-            await asyncio.sleep(SHORTEST_PAUSE_S)
-            await asyncio.wait({changed}, timeout=pause_s - SHORTEST_PAUSE_S)
-            if changed.done() and changed.exception() is not None:
-                log.warning("link %s: cannot watch for its return: %r", self.name, changed.exception())
-                await asyncio.sleep(pause_s)
-        finally:
-            changed.cancel()
-            with contextlib.suppress(asyncio.CancelledError, Exception):
-                await changed
-
-    def _set_state(self, state: State, reason: str | None) -> None:
-        """Attempts to open are no news while they end as the last one did."""
-        self.state, self.reason = state, reason
-        if state != "opening" and (state, reason) != self._told:
-            self._told = state, reason
-            self.since = self._clock()
-            log.info("link %s: %s%s", self.name, state, f": {reason}" if reason else "")

@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
 
+from psiu_broker import kept
 from psiu_broker import link as link_module
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.errors import LinkLost
@@ -109,8 +110,9 @@ async def hub() -> Hub:
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "FIRST_PAUSE_S", 0.002)
     monkeypatch.setattr(link_module, "FIRST_PAUSE_S", 0.002)
-    monkeypatch.setattr(link_module, "SHORTEST_PAUSE_S", 0.001)
+    monkeypatch.setattr(kept, "SHORTEST_PAUSE_S", 0.001)
 
 
 async def test_a_frame_heard_reaches_the_hub_with_its_way(hub: Hub) -> None:
@@ -387,7 +389,7 @@ async def test_a_device_that_appears_ends_the_pause(hub: Hub, monkeypatch: pytes
         async def changed(self) -> None:
             await appeared.wait()
 
-    monkeypatch.setattr(link_module, "FIRST_PAUSE_S", 3600.0)
+    monkeypatch.setattr(kept, "FIRST_PAUSE_S", 3600.0)
     adapter = Plugged()
     adapter.fail()
     link = make(hub, adapter)
@@ -414,4 +416,4 @@ async def test_the_pause_grows_in_vain_and_shrinks_only_when_bytes_arrive(hub: H
         assert pauses == sorted(pauses)
         assert grown >= pauses[-1]
         link.received(b"x", None)
-        assert link.pause_s == link_module.FIRST_PAUSE_S
+        assert link.pause_s == kept.FIRST_PAUSE_S
