@@ -101,6 +101,11 @@ class Adapter(BaseModel, ABC):
         raise ValueError("is for links with several far ends, and this one has a single one; remove it")
 
     @property
+    def reliable_stream(self) -> bool:
+        """Whether every byte arrives, unchanged and in order, or the transport is lost; default: no."""
+        return False
+
+    @property
     def bits_per_second(self) -> int | None:
         """What the line carries, ten bits a byte; None where it does not limit us."""
         return None

@@ -70,6 +70,16 @@ PHONES = """
     accept = true
     protocol = "psiu-ascii"
 """
+HILL = """
+    [trunks.hill]
+    adapter = "rfcomm"
+    address = "98:D3:31:00:00:01"
+"""
+VALLEY = """
+    [trunks.valley]
+    adapter = "serial"
+    device = "socket://10.0.0.7:4000"
+"""
 ROBOT_WIFI = WIFI.replace("psiu-ascii", "psiu-hexa") + 'topology = "point-to-point"\nremote = 3\n'
 
 
@@ -151,6 +161,23 @@ def test_a_phone_s_peer_is_its_address_in_upper_case(read):
 
 def test_a_broker_without_links_is_allowed(read):
     assert read(BROKER).links == {}
+
+
+def test_a_trunk_is_an_adapter_and_its_options(read):
+    hill, valley = read(BROKER + HILL + VALLEY).trunks.values()
+    assert (hill.name, hill.adapter_name, valley.name, valley.adapter_name) == ("hill", "rfcomm", "valley", "serial")
+    assert hill.adapter.model_dump()["address"] == "98:D3:31:00:00:01"
+    assert read(BROKER).trunks == {}
+
+
+def test_a_raw_serial_line_is_no_trunk_and_the_author_learns_why_and_what_to_do(problems):
+    (line,) = problems(BROKER + VALLEY.replace("socket://10.0.0.7:4000", "/dev/ttyUSB0"))
+    assert line == (
+        'trunks.valley.device: expected a stream that loses nothing, got "/dev/ttyUSB0":'
+        " a raw serial line loses and corrupts bytes unnoticed;"
+        ' use adapter = "rfcomm" or device = "socket://HOST:PORT",'
+        " or write [links.valley] with a protocol, and PSIU relays"
+    )
 
 
 def test_a_configuration_cannot_be_changed(read):
@@ -325,6 +352,43 @@ def test_a_robot_s_name_is_not_an_address(problems):
             WIFI + WIFI.replace("links.wifi", "links.lan").replace("127.0.0.1", "0.0.0.0"),
             'links.lan.listen: "0.0.0.0:9000" is taken by link wifi already',
             id="a UDP port twice",
+        ),
+        pytest.param(
+            VALLEY.replace("socket://10.0.0.7:4000", "0403:6001"),
+            'trunks.valley.device: expected a stream that loses nothing, got "0403:6001"',
+            id="a trunk on a raw serial line",
+        ),
+        pytest.param(
+            '[trunks.wifi]\nadapter = "udp"\nlisten = "127.0.0.1:9000"',
+            'trunks.wifi.adapter: expected a stream that loses nothing, got "udp", whose datagrams may be lost;',
+            id="a trunk of datagrams",
+        ),
+        pytest.param(
+            VALLEY.replace("trunks", "links") + 'protocol = "psiu-ascii"' + VALLEY,
+            'trunks.valley.device: "socket://10.0.0.7:4000" is taken by link valley already; give each its own',
+            id="a trunk on the device of a link",
+        ),
+        pytest.param(
+            PHONES + HILL.replace('address = "98:D3:31:00:00:01"', "accept = true"),
+            "trunks.hill.accept: link phones takes all who call hci0 already; keep one of them",
+            id="a trunk and a link that accept",
+        ),
+        pytest.param(
+            HILL + HILL.replace("hill", "dale"),
+            'trunks.dale.address: "98:D3:31:00:00:01" is taken by trunk hill already; give each its own',
+            id="two trunks to one broker",
+        ),
+        pytest.param(
+            HILL.replace("trunks.hill", 'trunks."the hill"'),
+            'trunks."the hill": expected a name of letters, digits, - and _; rename the trunk',
+            id="a trunk with a space in its name",
+        ),
+        pytest.param(HILL + 'protocol = "psiu-ascii"', "trunks.hill.protocol: unknown key; known: ", id="a protocol"),
+        pytest.param("[trunks]\nhill = 3", "trunks.hill: expected a table, got 3", id="a trunk that is no table"),
+        pytest.param(
+            HILL.replace("rfcomm", "rfcom"),
+            'trunks.hill.adapter: expected one of rfcomm, serial, udp, got "rfcom"; did you mean rfcomm?',
+            id="an unknown adapter of a trunk",
         ),
         pytest.param(
             HEXA + '[robots.A]\nlink="hexa"\naddress=1\n[robots.B]\nlink="hexa"\naddress=1',
@@ -592,7 +656,7 @@ def test_the_schema_accepts_the_readme_s_configuration_and_refuses_what_loading_
     schema = json_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     check = jsonschema.Draft202012Validator(json.loads(json.dumps(schema)))
-    good = tomllib.loads(dedent(AS_IN_THE_README))
+    good = tomllib.loads(dedent(AS_IN_THE_README + HILL + VALLEY))
     check.validate(good)
     check.validate(tomllib.loads(EXAMPLE.read_text()))
     for path, value in {
@@ -601,6 +665,8 @@ def test_the_schema_accepts_the_readme_s_configuration_and_refuses_what_loading_
         ("links", "radio", "adapter"): "seral",
         ("links", "wifi", "baudrate"): 9600,
         ("robots", "BRACO", "nodes", "garra", "type"): "srvo",
+        ("trunks", "hill", "adapter"): "udp",
+        ("trunks", "hill", "protocol"): "psiu-ascii",
         ("broker", "address"): 256,
         ("other",): 1,
         ("zenoh", "listen"): [],
@@ -654,7 +720,7 @@ def toml(value: object) -> str:
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.dictionaries(
-        st.sampled_from(["broker", "zenoh", "links", "robots"]),
+        st.sampled_from(["broker", "zenoh", "links", "trunks", "robots"]),
         values
         | st.dictionaries(st.sampled_from(["radio", "name", "A"]), st.dictionaries(st.sampled_from(KEYS), values)),
     )

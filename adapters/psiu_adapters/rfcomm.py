@@ -56,6 +56,10 @@ class Rfcomm(Adapter):
     def many_peers(self) -> bool:
         return self.accept
 
+    @property
+    def reliable_stream(self) -> bool:
+        return True
+
     def peer_named(self, text: str) -> Peer:
         return _bluetooth_address(text) if self.accept else super().peer_named(text)
 

@@ -77,6 +77,11 @@ class Serial(Adapter):
         character_bits = 1 + self.bytesize + (self.parity != "none") + self.stopbits
         return max(1, self.baudrate * BITS_A_BYTE // character_bits)
 
+    @property
+    def reliable_stream(self) -> bool:
+        """TCP's promise; a serial line knows nothing of what it lost."""
+        return self.scheme == "socket"
+
     async def open(self, receiver: Receiver) -> Transport:
         port, facts = await self._aside.run(self._open_port, unwanted=lambda opened: close_port(opened[0]))
         try:

@@ -45,7 +45,8 @@ def check(file: Path) -> None:
     """
     configuration = read(file)
     links, robots = len(configuration.links), len(configuration.robots)
-    click.echo(f"{file}: good: {_count(links, 'link')}, {_count(robots, 'robot')}")
+    trunks = f"{_count(len(configuration.trunks), 'trunk')}, " if configuration.trunks else ""
+    click.echo(f"{file}: good: {_count(links, 'link')}, {trunks}{_count(robots, 'robot')}")
     for warning in configuration.warnings:
         click.echo(f"warning: {warning}", err=True)
 

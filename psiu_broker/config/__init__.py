@@ -8,6 +8,7 @@ from psiu_broker.config.tables import (
     LinkConfiguration,
     LinkOptions,
     RobotConfiguration,
+    TrunkConfiguration,
     ZenohConfiguration,
 )
 
@@ -17,6 +18,7 @@ __all__ = [
     "LinkConfiguration",
     "LinkOptions",
     "RobotConfiguration",
+    "TrunkConfiguration",
     "ZenohConfiguration",
     "json_schema",
     "load",

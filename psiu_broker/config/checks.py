@@ -14,6 +14,7 @@ from psiu_broker.config.tables import (
     BrokerConfiguration,
     LinkConfiguration,
     RobotConfiguration,
+    TrunkConfiguration,
     ZenohConfiguration,
 )
 from psiu_broker.frame import Address
@@ -35,26 +36,47 @@ def check_nodes(nodes: Mapping[str, Node], key: Key, problems: Problems) -> None
             problems.add((*at, "node"), f"node {node.node} is {first} already; give it one name")
 
 
-def check_devices(links: Collection[LinkConfiguration], problems: Problems) -> None:
-    """A serial port, a UDP port, a robot's Bluetooth address or the calls to a controller belong to one link."""
+def check_trunk(trunk: TrunkConfiguration, key: Key, problems: Problems) -> None:
+    """Nothing that a trunk carries may be lost or changed unnoticed."""
+    if trunk.adapter.reliable_stream:
+        return
+    device = getattr(trunk.adapter, "device", None)
+    if isinstance(device, str):
+        option, found = "device", f"{got(device)}: a raw serial line loses and corrupts bytes unnoticed"
+    else:
+        why = "whose datagrams may be lost" if trunk.adapter.datagrams else "which does not promise one"
+        option, found = "adapter", f"{got(trunk.adapter_name)}, {why}"
+    problems.add(
+        (*key, option),
+        f'expected a stream that loses nothing, got {found}; use adapter = "rfcomm" or device = "socket://HOST:PORT",'
+        f" or write [links.{trunk.name}] with a protocol, and PSIU relays",
+    )
+
+
+def check_devices(
+    links: Collection[LinkConfiguration], trunks: Collection[TrunkConfiguration], problems: Problems
+) -> None:
+    """A serial port, a UDP port, a robot's Bluetooth address or the calls to a controller belong to one of them."""
     held: list[tuple[str, str, str]] = []
-    for link in links:
+    users = [("link", link.name, link.adapter) for link in links]
+    users += [("trunk", trunk.name, trunk.adapter) for trunk in trunks]
+    for kind, name, adapter in users:
         for option in ("device", "address", "listen"):
-            mine = getattr(link.adapter, option, None)
-            if not isinstance(mine, str) or getattr(link.adapter, "reuse", False):
+            mine = getattr(adapter, option, None)
+            if not isinstance(mine, str) or getattr(adapter, "reuse", False):
                 continue
             for other, theirs, holder in held:
                 if option == other and _same(option, mine, theirs):
-                    text = f"{got(mine)} is taken by link {holder} already; give each link its own"
-                    problems.add(("links", link.name, option), text)
-            held.append((option, mine, link.name))
+                    text = f"{got(mine)} is taken by {holder} already; give each its own"
+                    problems.add((f"{kind}s", name, option), text)
+            held.append((option, mine, f"{kind} {name}"))
     accepting: dict[str, str] = {}
-    for link in links:
-        if getattr(link.adapter, "accept", None) is True:
-            controller = str(getattr(link.adapter, "controller", ""))
-            if (first := accepting.setdefault(controller, link.name)) != link.name:
-                text = f"link {first} takes all who call {controller} already; keep one of them"
-                problems.add(("links", link.name, "accept"), text)
+    for kind, name, adapter in users:
+        if getattr(adapter, "accept", None) is True:
+            controller = str(getattr(adapter, "controller", ""))
+            if (first := accepting.setdefault(controller, f"{kind} {name}")) != f"{kind} {name}":
+                text = f"{first} takes all who call {controller} already; keep one of them"
+                problems.add((f"{kind}s", name, "accept"), text)
 
 
 def _same(option: str, a: str, b: str) -> bool:

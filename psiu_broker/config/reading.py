@@ -13,7 +13,14 @@ from pydantic import BaseModel
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config.checks import check_devices, check_far_end, check_identities, check_nodes, warnings_about
+from psiu_broker.config.checks import (
+    check_devices,
+    check_far_end,
+    check_identities,
+    check_nodes,
+    check_trunk,
+    warnings_about,
+)
 from psiu_broker.config.problems import Key, Problems, got, guess, suggestion
 from psiu_broker.config.tables import (
     LINK_NAME,
@@ -23,6 +30,7 @@ from psiu_broker.config.tables import (
     LinkOptions,
     RobotConfiguration,
     RobotTable,
+    TrunkConfiguration,
     ZenohConfiguration,
     robot_name,
 )
@@ -72,7 +80,7 @@ def _syntax(path: Path, message: str) -> str:
 
 def _configuration(document: dict[str, Any], file: str, problems: Problems) -> Configuration | None:
     """What the file says; None where it is wrong, with every mistake noted."""
-    sections = ("broker", "zenoh", "links", "robots")
+    sections = ("broker", "zenoh", "links", "trunks", "robots")
     for name in document:
         if name not in sections:
             problems.unknown((name,), sections)
@@ -82,14 +90,17 @@ def _configuration(document: dict[str, Any], file: str, problems: Problems) -> C
     robots_written = problems.table(document.get("robots", {}), ("robots",)) or {}
     links_written = problems.table(document.get("links", {}), ("links",)) or {}
     links = {name: _link(name, value, robots_written, own_address, problems) for name, value in links_written.items()}
+    trunks_written = problems.table(document.get("trunks", {}), ("trunks",)) or {}
+    trunks = {name: trunk for name, value in trunks_written.items() if (trunk := _trunk(name, value, problems))}
     robots = {name: _robot(name, value, links, problems) for name, value in robots_written.items()}
     whole_links = {name: link for name, link in links.items() if link}
     whole_robots = {name: robot for name, robot in robots.items() if robot}
-    check_devices(whole_links.values(), problems)
+    check_devices(whole_links.values(), trunks.values(), problems)
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
     if broker is None or zenoh is None or problems.lines:
         return None
-    return Configuration(broker, zenoh, whole_links, whole_robots, warnings_about(file, zenoh, whole_links.values()))
+    warnings = warnings_about(file, zenoh, whole_links.values())
+    return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks)
 
 
 def _link(
@@ -102,14 +113,8 @@ def _link(
         return None
     if not LINK_NAME.fullmatch(name):
         problems.add(key, "expected a name of letters, digits, - and _; rename the link")
-    adapter_name = _choice(table, key, "adapter", adapter_names(), problems)
+    adapter_name, adapter_model = _adapter(table, key, problems)
     protocol = _choice(table, key, "protocol", CODECS, problems)
-    adapter_model: type[Adapter] | None = None
-    if adapter_name:
-        try:
-            adapter_model = adapter_class(adapter_name)
-        except UnknownAdapter as error:
-            problems.add((*key, "adapter"), str(error))
     codec_model = CODECS[protocol].Options if protocol else None
     options = problems.read(LinkOptions, _share(table, LinkOptions), key)
     adapter = problems.read(adapter_model, _share(table, adapter_model), key) if adapter_model else None
@@ -130,6 +135,38 @@ def _link(
     if len(problems.lines) > before or not (adapter_name and adapter and protocol and codec and options):
         return None
     return LinkConfiguration(name, adapter_name, adapter, protocol, codec, options)
+
+
+def _trunk(name: str, value: object, problems: Problems) -> TrunkConfiguration | None:
+    key: Key = ("trunks", name)
+    before = len(problems.lines)
+    table = problems.table(value, key)
+    if table is None:
+        return None
+    if not LINK_NAME.fullmatch(name):
+        problems.add(key, "expected a name of letters, digits, - and _; rename the trunk")
+    adapter_name, adapter_model = _adapter(table, key, problems)
+    if adapter_model is None or adapter_name is None:
+        return None
+    options = {word: value for word, value in table.items() if word != "adapter"}
+    adapter = problems.read(adapter_model, options, key)
+    if adapter is None:
+        return None
+    trunk = TrunkConfiguration(name, adapter_name, adapter)
+    check_trunk(trunk, key, problems)
+    return trunk if len(problems.lines) == before else None
+
+
+def _adapter(table: dict[str, Any], key: Key, problems: Problems) -> tuple[str | None, type[Adapter] | None]:
+    """The name that the table chooses, and its adapter; None where there is none."""
+    name = _choice(table, key, "adapter", adapter_names(), problems)
+    if name is None:
+        return None, None
+    try:
+        return name, adapter_class(name)
+    except UnknownAdapter as error:
+        problems.add((*key, "adapter"), str(error))
+        return name, None
 
 
 def _choice(table: dict[str, Any], key: Key, word: str, known: Collection[str], problems: Problems) -> str | None:

@@ -35,6 +35,15 @@ def json_schema() -> dict[str, Any]:
         + [only_if("protocol", name, codec.Options) for name, codec in sorted(CODECS.items())],
         "unevaluatedProperties": False,
     }
+    streams = [name for name in adapter_names() if not adapter_class(name).datagrams]
+    trunk: dict[str, Any] = {
+        "type": "object",
+        "properties": {"adapter": {"enum": streams, "description": "how the other broker is reached"}},
+        "required": ["adapter"],
+        "allOf": [only_if("adapter", name, adapter_class(name)) for name in streams],
+        "unevaluatedProperties": False,
+    }
+    names = {"pattern": f"^{LINK_NAME.pattern}$"}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "psiu-broker configuration",
@@ -44,9 +53,10 @@ def json_schema() -> dict[str, Any]:
             "zenoh": schema(ZenohConfiguration),
             "links": {
                 "type": "object",
-                "propertyNames": {"pattern": f"^{LINK_NAME.pattern}$"},
+                "propertyNames": names,
                 "additionalProperties": link,
             },
+            "trunks": {"type": "object", "propertyNames": names, "additionalProperties": trunk},
             "robots": {"type": "object", "additionalProperties": schema(RobotTable)},
         },
         "required": ["broker"],

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -133,6 +133,15 @@ class LinkConfiguration:
 
 
 @dataclass(frozen=True, slots=True)
+class TrunkConfiguration:
+    """A reliable stream that carries the Zenoh session to another broker, and how it is opened."""
+
+    name: str
+    adapter_name: str
+    adapter: Adapter
+
+
+@dataclass(frozen=True, slots=True)
 class RobotConfiguration:
     """A robot that the user named: its link, its PSIU HEXA address where it has one, and its nodes."""
 
@@ -155,3 +164,4 @@ class Configuration:
     links: Mapping[str, LinkConfiguration]
     robots: Mapping[str, RobotConfiguration]
     warnings: tuple[str, ...] = ()
+    trunks: Mapping[str, TrunkConfiguration] = field(default_factory=dict)
