@@ -12,7 +12,7 @@ from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.round_trip import RoundTrip
-from psiu_broker.bus.session import Session
+from psiu_broker.bus.session import Session, plain
 from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
@@ -238,19 +238,18 @@ class Broker:
         """Open another session when Zenoh lost the one we had."""
         while True:
             await self._bus_lost.wait()
-            self._bus_lost.clear()
             self.exchange.bus = NoBus()
             lost, self._bus = self._bus, None
-            while self._bus is None:
+            try:
                 if lost is not None:
-                    await lost.calls.close()
-                    await lost.session.close()
-                    lost = None
-                try:
-                    await self._open_bus()
-                except BusError as error:
-                    log.warning("the bus cannot be opened again: %s; trying on", error)
-                    await asyncio.sleep(REOPEN_S)
+                    await lost.close()
+                self._bus_lost.clear()
+                await self._open_bus()
+            except Exception as error:  # whatever it is, the bus must come back
+                trouble = error if isinstance(error, BusError) else repr(error)
+                log.warning("the bus cannot be opened again: %s; trying on", trouble)
+                self._bus_lost.set()
+                await asyncio.sleep(REOPEN_S)
 
     async def _tick(self) -> None:
         while True:
@@ -337,9 +336,18 @@ class _Bus:
                 await Queries.open(session, keys, name, broker),
                 await RoundTrip.open(session, keys, name),
             )
-        except BusError:
+        except BaseException as error:
             await session.close()
+            if session.panicked(error):
+                raise BusError(f"zenoh: {plain(error)}") from error
             raise
+
+    async def close(self) -> None:
+        """Answer the calls under way and close the session, also when cancelled meanwhile."""
+        try:
+            await self.calls.close()
+        finally:
+            await self.session.close()
 
 
 def _describer(configuration: Configuration) -> Callable[[Frame], Mapping[str, Any]]:

@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from psiu_broker import broker as broker_module
 from psiu_broker.broker import Broker
+from psiu_broker.bus.round_trip import RoundTrip
+from psiu_broker.bus.session import Session
 from psiu_broker.config import load
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
@@ -293,6 +296,49 @@ async def test_a_robot_of_bytes_stands_on_the_bus_under_its_name(lab: Lab) -> No
 async def test_a_port_that_is_taken_is_one_clear_line(lab: Lab) -> None:
     with pytest.raises(BusError, match="in use"):
         await Broker(load(lab.file)).start()
+
+
+class PanicException(BaseException):
+    """As Zenoh raises it; only its name tells."""
+
+
+@pytest.mark.parametrize("trouble", [BusError("no"), RuntimeError("no thread"), PanicException("in Rust")])
+async def test_a_lost_bus_is_opened_again_whatever_goes_wrong_at_first(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, trouble: BaseException
+) -> None:
+    monkeypatch.setattr(broker_module, "REOPEN_S", 0.01)
+    bus, open_round_trip = lab.broker._bus, RoundTrip.open
+    assert bus is not None
+
+    async def fail(*_: object) -> RoundTrip:
+        monkeypatch.setattr(RoundTrip, "open", open_round_trip)
+        raise trouble
+
+    monkeypatch.setattr(RoundTrip, "open", fail)
+    bus.session.panicked(PanicException("in Rust"))
+    await until(lambda: lab.broker._bus not in (None, bus))
+    assert RoundTrip.open == open_round_trip
+    assert await lab.broker.healthy()
+    assert lab.broker.exchange.bus is not bus.publisher
+    assert bus.session.zenoh.is_closed()
+
+
+async def test_a_broker_that_stops_while_it_gives_up_a_lost_bus_leaves_the_port_free(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = lab.broker._bus
+    assert bus is not None
+    closing = asyncio.Event()
+
+    async def never() -> None:
+        closing.set()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(bus.calls, "close", never)
+    bus.session.panicked(PanicException("in Rust"))
+    await closing.wait()
+    await lab.broker.stop()
+    await (await Session.open(lab.broker.configuration.zenoh.listen)).close()
 
 
 async def test_the_configuration_is_told_without_secrets(tmp_path: Path) -> None:

@@ -128,10 +128,21 @@ class Calls:
         return _Accepted(key, robot, command, request, query)
 
     def _begin(self, accepted: _Accepted) -> None:
+        if self._closed:  # `close` may have told its tasks to end already; one that never began says nothing
+            self._turn_away(accepted)
+            return
         work = self._serve_put(accepted) if accepted.query is None else self._serve(accepted, accepted.query)
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    def _turn_away(self, accepted: _Accepted) -> None:
+        stopping = CallError("shutting_down", "the broker is stopping")
+        if accepted.query is None:
+            self._refused_put(accepted.key, stopping)
+            self._room.release()
+        else:
+            self._replies.refuse(accepted.query, stopping).add_done_callback(lambda _: self._room.release())
 
     async def _serve(self, accepted: _Accepted, query: zenoh.Query) -> None:
         reply = await self._outcome(accepted, query)

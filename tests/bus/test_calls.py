@@ -266,11 +266,38 @@ async def test_a_broker_that_stops_says_so_to_those_who_come_then(
     told: list[str] = []
     calls._replies.refuse = lambda query, error: told.append(error.code) or Future()  # type: ignore[method-assign]
     calls._begin(asked)  # not even begun when the broker stops
+    asyncio.get_running_loop().call_soon(calls._begin, asked)  # comes while it stops
     await calls.close()
     calls._begin(asked)
-    await until(lambda: len(told) == 3)
-    assert told == ["shutting_down"] * 3
+    await until(lambda: len(told) == 4)
+    assert told == ["shutting_down"] * 4
     earlier.cancel()
+
+
+async def test_what_comes_to_a_broker_that_stops_takes_nobodys_room(
+    session: Session, keys: Keys, program: zenoh.Session, robots: Robots, monkeypatch: pytest.MonkeyPatch, until: Until
+) -> None:
+    monkeypatch.setattr(calls_module, "AT_ONCE_MAX", 1)
+    calls = await Calls.open(session, keys, robots.call, robots.send)
+    await calls.close()
+    program.put("psiu/@call/A/b", b"")
+    await until(lambda: calls.refused_puts)
+    for _ in range(2):
+        [refusal] = await ask(program, "psiu/@call/A/b")
+        assert refusal.error == "shutting_down"
+    assert robots.called == robots.sent == []
+
+
+async def test_a_put_gives_its_room_back(
+    session: Session, keys: Keys, program: zenoh.Session, robots: Robots, monkeypatch: pytest.MonkeyPatch, until: Until
+) -> None:
+    monkeypatch.setattr(calls_module, "AT_ONCE_MAX", 1)
+    calls = await Calls.open(session, keys, robots.call, robots.send)
+    program.put("psiu/@call/A/refused", b"")
+    await until(lambda: robots.sent)
+    [answer] = await ask(program, "psiu/@call/A/b")
+    assert answer["status"] == "sucesso"
+    await calls.close()
 
 
 async def test_an_answer_on_its_way_is_not_lost_when_the_broker_stops(
