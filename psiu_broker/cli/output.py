@@ -81,6 +81,11 @@ def ago(seconds: float) -> str:
     return f"{seconds:.0f} s ago" if seconds >= 1 else "now"
 
 
+def milliseconds(ms: float) -> str:
+    """A duration for a person: ``0.42 ms``, ``7.1 ms``, ``120 ms``."""
+    return f"{ms:.{2 if ms < 1 else 1 if ms < 100 else 0}f} ms"
+
+
 def styled(text: str, **style: Any) -> str:
     """`text` in a colour, where there is a terminal whose user wants colours."""
     return click.style(text, **style) if on_terminal() and not os.environ.get("NO_COLOR") else text

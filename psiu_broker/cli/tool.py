@@ -21,6 +21,7 @@ _HERE: Final = "psiu_broker.cli"
         "links": ("List the links and what they wait for.", f"{_HERE}.tables:links"),
         "routes": ("List where frames for each robot go.", f"{_HERE}.tables:routes"),
         "why": ("Tell what would become of a frame from A to B.", f"{_HERE}.tables:why"),
+        "mesh": ("Show the brokers, what is between them, and who owns which robot.", f"{_HERE}.mesh:mesh"),
         "ledger": ("Show the fate of every frame.", f"{_HERE}.tables:ledger"),
         "status": ("Show how the broker is.", f"{_HERE}.tables:status"),
         "decode": ("Decode bytes into frames.", f"{_HERE}.decode:decode"),
