@@ -268,9 +268,9 @@ class Broker:
                 self._seen[link.name] = link.since
                 self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
         if self._bus is not None:
-            for route in self._changed.values():
+            for robot in tuple(self._changed):
+                route = self._changed.pop(robot)  # first: one that cannot be told must not be in the way of the others
                 self._bus.publisher.publish_card(route.robot, self.report.card(route))
-            self._changed.clear()
 
     def _checks(self) -> dict[str, bool]:
         links = {task.get_name(): not task.done() for task in self._link_tasks}

@@ -17,7 +17,8 @@ from psiu_broker.bus.session import Session
 from psiu_broker.config import load
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Answer, CallRequest
+from psiu_broker.messages import Answer, CallRequest, Card
+from psiu_broker.routing.table import Route
 from psiu_broker.simulator import AsciiRobot, Extra, HexaRobot, PtyPort, UdpPort
 
 CONFIGURATION = """
@@ -296,6 +297,20 @@ async def test_a_robot_of_bytes_stands_on_the_bus_under_its_name(lab: Lab) -> No
 async def test_a_port_that_is_taken_is_one_clear_line(lab: Lab) -> None:
     with pytest.raises(BusError, match="in use"):
         await Broker(load(lab.file)).start()
+
+
+async def test_a_card_that_cannot_be_told_is_in_nobodys_way(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+
+    def card(route: Route) -> Card:
+        told.append(str(route.robot))
+        raise ValueError(f"the card of {route.robot}")
+
+    await until(lambda: not lab.broker._changed)
+    monkeypatch.setattr(lab.broker.report, "card", card)
+    lab.broker._note(lab.broker.exchange.router.robots())
+    await until(lambda: not lab.broker._changed)
+    assert sorted(told) == ["BETA", "BRACO", "MNERIM"]
 
 
 class PanicException(BaseException):

@@ -11,17 +11,18 @@ import math
 import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import zenoh
 from pydantic import ValidationError
 
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.replies import Replies
-from psiu_broker.bus.session import Session, aside, json_of, plain
-from psiu_broker.errors import BusError, CallError
+from psiu_broker.bus.session import Session, json_of
+from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Answer, CallRequest
+from psiu_broker.routing.outbox import is_stop
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +33,7 @@ Send = Callable[[Address, str, CallRequest], Awaitable[None]]
 """Send a command and go on; raises CallError."""
 
 AT_ONCE_MAX: Final = 256
-"""Calls under way or waiting their turn; one more is refused as busy."""
+"""Calls under way or waiting their turn, and as many stops besides; one more is refused as busy."""
 
 PAYLOAD_MAX: Final = 65_536
 RING: Final = 1024
@@ -47,6 +48,8 @@ class _Accepted(NamedTuple):
     command: str
     request: CallRequest
     query: zenoh.Query | None
+    room: threading.BoundedSemaphore
+    """Where it takes a place until it has ended."""
 
 
 class Calls:
@@ -60,6 +63,7 @@ class Calls:
         self._send = send
         self._replies = Replies(session, "bus-call")
         self._room = threading.BoundedSemaphore(AT_ONCE_MAX)
+        self._stop_room = threading.BoundedSemaphore(AT_ONCE_MAX)
         self._closed = False
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -71,22 +75,20 @@ class Calls:
             BusError: the session is closed or lost.
         """
 
-        def declare() -> tuple[Any, Any]:
-            ring = zenoh.handlers.RingChannel
-            return (
-                session.zenoh.declare_queryable(keys.every_call, ring(RING)),
-                session.zenoh.declare_subscriber(keys.every_call, ring(RING)),
-            )
-
         calls = cls(session, keys, call, send)
-        try:
-            queryable, subscriber = await aside(declare)
-        except zenoh.ZError as error:
-            raise BusError(f"zenoh: {plain(error)}") from error
-        session.declared(queryable)
-        session.declared(subscriber)
-        session.bridge(queryable, calls._sift_query, calls._begin, name="bus-calls")
-        session.bridge(subscriber, calls._sift_put, calls._begin, name="bus-call-puts")
+        ring = zenoh.handlers.RingChannel
+        await session.serve(
+            lambda: session.zenoh.declare_queryable(keys.every_call, ring(RING)),
+            calls._sift_query,
+            calls._begin,
+            name="bus-calls",
+        )
+        await session.serve(
+            lambda: session.zenoh.declare_subscriber(keys.every_call, ring(RING)),
+            calls._sift_put,
+            calls._begin,
+            name="bus-call-puts",
+        )
         return calls
 
     async def close(self) -> None:
@@ -123,9 +125,10 @@ class Calls:
         except ValueError as error:
             raise CallError("bad_request", str(error)) from error
         request = read_request(payload.to_bytes() if payload is not None else b"")
-        if not self._room.acquire(blocking=False):
+        room = self._stop_room if is_stop(command) else self._room
+        if not room.acquire(blocking=False):
             raise CallError("busy", f"{AT_ONCE_MAX} calls are under way already")
-        return _Accepted(key, robot, command, request, query)
+        return _Accepted(key, robot, command, request, query, room)
 
     def _begin(self, accepted: _Accepted) -> None:
         if self._closed:  # `close` may have told its tasks to end already; one that never began says nothing
@@ -140,13 +143,13 @@ class Calls:
         stopping = CallError("shutting_down", "the broker is stopping")
         if accepted.query is None:
             self._refused_put(accepted.key, stopping)
-            self._room.release()
+            accepted.room.release()
         else:
-            self._replies.refuse(accepted.query, stopping).add_done_callback(lambda _: self._room.release())
+            self._replies.refuse(accepted.query, stopping).add_done_callback(lambda _: accepted.room.release())
 
     async def _serve(self, accepted: _Accepted, query: zenoh.Query) -> None:
         reply = await self._outcome(accepted, query)
-        reply.add_done_callback(lambda _: self._room.release())
+        reply.add_done_callback(lambda _: accepted.room.release())
 
     async def _outcome(self, accepted: _Accepted, query: zenoh.Query) -> "Future[None]":
         """The reply to `query`, on its way."""
@@ -172,7 +175,7 @@ class Calls:
         except Exception:
             logger.exception("a put to %s %s failed inside the broker", accepted.robot, accepted.command)
         finally:
-            self._room.release()
+            accepted.room.release()
 
     def _refused_put(self, key: str, error: CallError) -> None:
         self.refused_puts += 1

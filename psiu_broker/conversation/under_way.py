@@ -10,7 +10,7 @@ from psiu_broker.conversation.complaints import Sending
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address, Frame
 from psiu_broker.profiles.profile import Profile, Reading, Reply, Request
-from psiu_broker.routing.outbox import STOP_WORDS
+from psiu_broker.routing.outbox import is_stop
 
 _HEARD_KEPT: Final = 8
 
@@ -52,7 +52,7 @@ class UnderWay:
 
     @property
     def is_stop(self) -> bool:
-        return self.request.subject in STOP_WORDS
+        return is_stop(self.request.subject)
 
     @property
     def has_reply(self) -> bool:

@@ -13,14 +13,19 @@ COMMAND_LANE: Final = 1
 QUESTION_LANE: Final = 2
 
 STOP_WORDS: Final = frozenset({"pare", "parar", "para", "stop"})
-"""Command words that overtake everything that waits."""
+"""Command words that stop a robot, as `is_stop` knows them."""
 
 QUESTION_WORDS: Final = frozenset({"qualseunome", "quantoscomandos", "exibecomando", "exibecomandos"})
 
 
+def is_stop(command: str) -> bool:
+    """Whether `command`, in any case, overtakes everything that waits."""
+    return command.lower() in STOP_WORDS
+
+
 def lane(frame: Frame) -> int:
     """The lane of `frame`: stops before commands and answers, these before questions about a robot."""
-    if frame.subject in STOP_WORDS:
+    if is_stop(frame.subject):
         return STOP_LANE
     return QUESTION_LANE if frame.subject in QUESTION_WORDS else COMMAND_LANE
 

@@ -237,6 +237,8 @@ async def test_more_calls_than_are_taken_at_once_are_refused_as_busy(
     await until(lambda: len(robots.called) == 3)
     [refusal] = await ask(program, "psiu/@call/A/more")
     assert refusal.error == "busy"
+    waiting.append(asyncio.create_task(ask(program, "psiu/@call/A/Pare")))  # a stop is let in all the same
+    await until(lambda: len(robots.called) == 4)
     robots.hold.set()
     for each in await asyncio.gather(*waiting):
         assert each[0]["status"] == "sucesso"

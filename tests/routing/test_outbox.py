@@ -34,7 +34,7 @@ def test_a_stop_overtakes_everything_and_a_question_waits_for_commands() -> None
 
 
 def test_the_words_decide_the_lane() -> None:
-    assert lane(frame("pare")) == STOP_LANE
+    assert lane(frame("pare")) == lane(frame("PARE")) == STOP_LANE
     assert lane(frame("parafrente")) == COMMAND_LANE
     assert lane(frame("node/4")) == COMMAND_LANE
     assert lane(frame("qualseunome")) == QUESTION_LANE
