@@ -5,13 +5,14 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from math import inf
-from typing import Literal, Protocol, cast
+from typing import Final, Literal, Protocol, cast
 
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
+from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate
 from psiu_broker.routing.router import DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
@@ -24,6 +25,10 @@ from psiu_broker.routing.verdicts import (
     Account,
     Verdict,
 )
+
+SEARCHES_AT_ONCE: Final = 3
+SEARCH_EVERY_S: Final = 10.0
+"""In the long run, for one robot that others search: on slow links a search would else come round to us for ever."""
 
 
 class Bus(Protocol):
@@ -93,6 +98,7 @@ class Exchange:
         self.accounts: dict[str, Account] = {SELF.link: Account()}
         self.router = router
         self.holding = holding or Holding()
+        self._searches = Rarely()
         self.resident: Resident
         self._ports: dict[str, Port] = {}
         self._route_age_s: dict[str, float] = {}
@@ -276,15 +282,20 @@ class Exchange:
         self.bus.publish(frame, way, self._wall_clock())
 
     def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
-        """Hold a frame for an unknown robot, and ask for the robot by its name, once."""
-        if way is SELF:
+        """Hold a frame for an unknown robot, and ask for the robot by its name."""
+        robot = frame.destination
+        if way is SELF or not self.holding.add(frame, way, now):
             return NO_ROUTE
-        asked = self.holding.asked(frame.destination)
-        if not self.holding.add(frame, way, now):
-            return NO_ROUTE
-        if not asked:
-            self._ask_names(frame.destination, hops, now)
+        if self.holding.is_due(robot, now) and self._may_search(frame, now):
+            self.holding.asked(robot, now)
+            self._ask_names(robot, hops, now)
         return None
+
+    def _may_search(self, frame: Frame, now: float) -> bool:
+        """Whether `frame` may have us ask for its destination; it may be another broker's search for the same."""
+        return frame.subject != "qualseunome" or self._searches.may(
+            frame.destination, now, SEARCH_EVERY_S, SEARCHES_AT_ONCE
+        )
 
     def _ask_names(self, robot: Address, hops: tuple[Way, ...], now: float) -> None:
         if not hops:

@@ -172,6 +172,16 @@ def test_a_robot_that_nobody_has_heard_is_found_across_the_ring() -> None:
     assert ring.silent()
 
 
+@settings(max_examples=40, deadline=None)
+@given(delays)
+def test_the_search_for_a_robot_that_is_nowhere_ends(delays_s: tuple[float, float, float]) -> None:
+    ring = Ring(delays_s)
+    ring.says("PC", "GHOST", "parafrente", "1")
+    ring.run(60)
+    assert ring.silent()
+    assert ring.transmissions < 50
+
+
 @pytest.mark.parametrize("broker", ["A", "B", "C"])
 def test_the_books_of_every_broker_balance(broker: str) -> None:
     ring = Ring((0.1, 0.7, 0.3))

@@ -27,7 +27,28 @@ def test_a_frame_is_held_only_briefly() -> None:
     assert len(holding.expire(0.5)) == 1
     assert holding.waiting_from("radio") == 1
     assert len(holding.expire(0.8)) == 1
-    assert not holding.asked(MNERIM)
+    assert holding.waiting_from("radio") == 0
+
+
+def test_a_robot_is_asked_for_again_while_frames_for_it_keep_coming() -> None:
+    holding = Holding(0.5)
+    asked = []
+    for tenth in range(20):
+        now = tenth / 10
+        holding.expire(now)
+        holding.add(frame("MNERIM"), RADIO, now)
+        if holding.is_due(MNERIM, now):
+            holding.asked(MNERIM, now)
+            asked.append(now)
+    assert asked == [0.0, 0.5, 1.0, 1.5]
+
+
+def test_a_robot_that_was_heard_and_lost_again_is_asked_for_at_once() -> None:
+    holding = Holding(0.5)
+    holding.add(frame("MNERIM"), RADIO, 0.0)
+    holding.asked(MNERIM, 0.0)
+    holding.release(MNERIM)
+    assert holding.is_due(MNERIM, 0.1)
 
 
 def test_a_flood_of_unknown_names_is_neither_kept_nor_asked_for() -> None:
