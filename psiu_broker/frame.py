@@ -94,6 +94,10 @@ class Way(NamedTuple):
         return self.link if self.peer is None else f"{self.link}/{peer_text(self.peer)}"
 
 
+MESH: Final = "@mesh"
+"""The link, in ways and accounts, whose far ends are the other brokers, by name."""
+
+
 def peer_text(peer: object) -> str | None:
     """A far end in words, as ``host:port`` over UDP; None where a link has only one."""
     match peer:

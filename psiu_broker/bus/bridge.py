@@ -52,6 +52,11 @@ class Bridge(Generic[T, Kept]):
         self._thread = threading.Thread(target=self._read, name=f"psiu-{name}", daemon=True)
         self._thread.start()
 
+    @property
+    def alive(self) -> bool:
+        """Whether its source goes on."""
+        return self._thread.is_alive()
+
     def join(self, timeout_s: float) -> None:
         """Wait for the thread to end, once the source has."""
         if self._thread is not threading.current_thread():

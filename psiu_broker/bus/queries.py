@@ -9,8 +9,8 @@ import zenoh
 
 from psiu_broker.bus.keys import Keys, robot
 from psiu_broker.bus.replies import Replies, Values
-from psiu_broker.bus.session import JSON, Session, aside, json_of, plain
-from psiu_broker.errors import BusError, CallError
+from psiu_broker.bus.session import JSON, Session, json_of
+from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Card, Health, Ledger, Link, Route, Status, Why
 
@@ -70,21 +70,20 @@ class Queries:
             BusError: the session is closed or lost.
         """
         queries = cls(session, keys, broker, source)
-        try:
-            for key, values in (
-                (keys.broker(broker, "**"), queries._broker_values),
-                (keys.every_card, queries._card_values),
-            ):
-                await queries._declare(key, values)
-        except zenoh.ZError as error:
-            raise BusError(f"zenoh: {plain(error)}") from error
+        for key, values in (
+            (keys.broker(broker, "**"), queries._broker_values),
+            (keys.every_card, queries._card_values),
+        ):
+            await queries._declare(key, values)
         return queries
 
     async def _declare(self, key: str, values: Callable[[zenoh.KeyExpr], Values]) -> None:
-        queryable = await aside(self._session.zenoh.declare_queryable, key, zenoh.handlers.RingChannel(RING))
-        self._session.declared(queryable)
-        self._session.bridge(
-            queryable, self._sift, lambda query: self._answer(query, values), name="bus-queries", turn_max=TURN_MAX
+        await self._session.serve(
+            lambda: self._session.zenoh.declare_queryable(key, zenoh.handlers.RingChannel(RING)),
+            self._sift,
+            lambda query: self._answer(query, values),
+            name="bus-queries",
+            turn_max=TURN_MAX,
         )
 
     def _sift(self, query: zenoh.Query) -> zenoh.Query | None:

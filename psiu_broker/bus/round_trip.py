@@ -34,12 +34,7 @@ class RoundTrip:
             ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(RING)
             return session.zenoh.declare_queryable(trip._key, ring, allowed_origin=zenoh.Locality.SESSION_LOCAL)
 
-        try:
-            queryable = await aside(declare)
-        except zenoh.ZError as error:
-            raise BusError(f"zenoh: {plain(error)}") from error
-        session.declared(queryable)
-        session.bridge(queryable, lambda query: query, trip._answer, name="bus-alive")
+        await session.serve(declare, lambda query: query, trip._answer, name="bus-alive")
         return trip
 
     async def measure(self, timeout_s: float) -> float:

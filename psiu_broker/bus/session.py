@@ -5,10 +5,10 @@ import atexit
 import json
 import logging
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Literal, Protocol, TypeVar
 
 import zenoh
 
@@ -16,8 +16,11 @@ from psiu_broker.bus.bridge import TURN_MAX, Bridge
 from psiu_broker.errors import BusError
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 Kept = TypeVar("Kept")
 Result = TypeVar("Result")
+
+Mode = Literal["peer", "router"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +59,35 @@ class Declared(Protocol):
     def undeclare(self) -> None: ...
 
 
+class Source(Declared, Protocol[T_co]):
+    """A declared subscriber or queryable: what arrives, until it is undeclared."""
+
+    def __iter__(self) -> Iterator[T_co]: ...
+
+
+class _Service:
+    """One subscriber or queryable and how to declare it."""
+
+    def __init__(self, declare: Callable[[], Source[T]], read: Callable[[Source[T]], None]) -> None:
+        self._declare = declare
+        self._read = read
+        self._source: Any = None
+
+    def begin(self) -> None:
+        """Declare it, once more if it was declared before. Waits for Zenoh."""
+        self.end()
+        self._source = self._declare()
+
+    def read(self) -> None:
+        """Hand on what arrives. On the loop."""
+        self._read(self._source)
+
+    def end(self) -> None:
+        source, self._source = self._source, None
+        if source is not None:
+            source.undeclare()
+
+
 class Session:
     """One open Zenoh session, its threads and its declarations.
 
@@ -72,6 +104,7 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._workers: list[Executor] = []
         self._declared: list[Declared] = []
+        self._services: list[_Service] = []
         self._bridges: list[Bridge[Any, Any]] = []
         # Our reader threads must be out of Zenoh before the interpreter goes, also after an error.
         atexit.register(self._close)
@@ -82,15 +115,21 @@ class Session:
         listen: Sequence[str],
         *,
         connect: Sequence[str] = (),
+        mode: Mode = "peer",
+        discover: bool = False,
         lost: Callable[[BusError], None] = lambda error: None,
     ) -> "Session":
         """Listen at `listen`, and connect to each of `connect`, whenever somebody is there.
+
+        Args:
+            mode: "peer": who connects to one another talks, and nobody relays; "router": Zenoh relays.
+            discover: find others on the local network by multicast.
 
         Raises:
             BusError: an endpoint is taken, impossible or misspelt.
         """
         try:
-            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect)))
+            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect, mode, discover)))
             session = await aside(zenoh.open, config)
         except Exception as error:
             raise BusError(_open_problem(error)) from error
@@ -117,6 +156,45 @@ class Session:
         failed = self._reader_failed
         self._bridges.append(Bridge(source, sift, handle, name=name, failed=failed, turn_max=turn_max))
 
+    async def serve(
+        self,
+        declare: Callable[[], "Source[T]"],
+        sift: Callable[[T], Kept | None],
+        handle: Callable[[Kept], None],
+        *,
+        name: str,
+        turn_max: int = TURN_MAX,
+    ) -> None:
+        """Declare a subscriber or queryable and bridge it to the loop, also after `declare_anew`.
+
+        Raises:
+            BusError: the session is closed or lost.
+        """
+        service = _Service(declare, lambda source: self.bridge(source, sift, handle, name=name, turn_max=turn_max))
+        try:
+            await aside(service.begin)
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+        service.read()
+        self._services.append(service)
+
+    async def declare_anew(self) -> None:
+        """Declare once more what is served, for those who have lost sight of it; never raises.
+
+        For an instant in between, what arrives finds nobody.
+        """
+        self._bridges = [bridge for bridge in self._bridges if bridge.alive]
+        for service in tuple(self._services):
+            try:
+                await aside(service.begin)
+                service.read()
+            except Exception as error:
+                logger.warning("declaring anew: %s", plain(error))
+            except BaseException as error:
+                if not self.panicked(error):
+                    raise
+                return
+
     def worker(self, name: str) -> Executor:
         """A thread, begun when needed, for what may wait for a program; `close` ends it."""
         worker = ThreadPoolExecutor(1, f"psiu-{name}")
@@ -141,7 +219,8 @@ class Session:
     def _close(self) -> None:
         atexit.unregister(self._close)
         close: Callable[[], None] = self.zenoh.close
-        for end in (*(what.undeclare for what in reversed(self._declared)), close):
+        served = [service.end for service in self._services]
+        for end in (*(what.undeclare for what in reversed(self._declared)), *served, close):
             try:
                 end()
             except Exception as error:
@@ -151,6 +230,7 @@ class Session:
                     raise
                 logger.debug("closing the bus: %s", plain(error))
         self._declared.clear()
+        self._services.clear()
         for bridge in self._bridges:
             bridge.join(_THREAD_END_S)
         self._bridges.clear()
@@ -167,9 +247,9 @@ def _is_panic(error: BaseException) -> bool:
     return type(error).__name__ == "PanicException"
 
 
-def _configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, object]:
+def _configuration(listen: Sequence[str], connect: Sequence[str], mode: Mode, discover: bool) -> dict[str, object]:
     return {
-        "mode": "peer",
+        "mode": mode,
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
         "connect": {
             "endpoints": list(connect),
@@ -177,7 +257,12 @@ def _configuration(listen: Sequence[str], connect: Sequence[str]) -> dict[str, o
             "exit_on_failure": False,
             "retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2},
         },
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "scouting": {
+            "delay": 0,
+            "multicast": {"enabled": discover, "autoconnect": {mode: [mode]}},
+            # Peers tell each other of those that they are connected to: one endpoint that all know is enough.
+            "gossip": {"enabled": mode == "peer", "autoconnect": {"peer": ["peer"]}},
+        },
         "transport": {
             "shared_memory": {"enabled": False},
             "link": {

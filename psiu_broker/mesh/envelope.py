@@ -15,7 +15,7 @@ from psiu_broker.frame import Address, Frame
 VERSION: Final = 1
 LONGEST: Final = 65_535
 
-_HEADER: Final = struct.Struct(">BQQQIhhH")
+_HEADER: Final = struct.Struct(">BQQQQIhhH")
 _MARK: Final = "\0"
 
 
@@ -24,8 +24,10 @@ class Envelope(NamedTuple):
 
     epoch: int
     """Which life of the sending broker this is: a random 64-bit number."""
+    to_epoch: int
+    """For which life of the receiving broker it is meant."""
     sequence: int
-    """The place in the series from this broker to the receiver, of one lane, in this life; counts from 1."""
+    """The place in the series from the one to the other, of one lane, in these lives; counts from 1."""
     sent_us: int
     """What the sender's steady clock read, in microseconds."""
     age_ms: int
@@ -50,6 +52,7 @@ def pack(envelope: Envelope) -> bytes:
     header = _HEADER.pack(
         VERSION,
         envelope.epoch,
+        envelope.to_epoch,
         envelope.sequence,
         envelope.sent_us,
         min(max(envelope.age_ms, 0), 0xFFFFFFFF),
@@ -64,19 +67,17 @@ def unpack(data: bytes) -> Envelope | None:
     """What `pack` made; None for anything else. Never raises."""
     if len(data) < _HEADER.size or data[0] != VERSION:
         return None
-    _, epoch, sequence, sent_us, age_ms, source, destination, length = _HEADER.unpack_from(data)
+    _, epoch, to_epoch, sequence, sent_us, age_ms, source, destination, length = _HEADER.unpack_from(data)
     start = _HEADER.size + length
     try:
-        protocol, source_name, source_domain, name, domain = (
-            data[_HEADER.size : start].decode("utf-8").split(_MARK)
-        )
+        protocol, source_name, source_domain, name, domain = data[_HEADER.size : start].decode("utf-8").split(_MARK)
         make = _MAKERS[protocol]
     except (ValueError, KeyError):
         return None
     if len(data) < start or not (_is_address(source_name, source) and _is_address(name, destination)):
         return None
     frame = make(Address(source_name, source, source_domain), Address(name, destination, domain), data[start:])
-    return None if frame is None else Envelope(epoch, sequence, sent_us, age_ms, frame)
+    return None if frame is None else Envelope(epoch, to_epoch, sequence, sent_us, age_ms, frame)
 
 
 def _is_address(name: str, number: int) -> bool:

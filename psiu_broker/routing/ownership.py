@@ -121,10 +121,10 @@ class Ownership:
         if len(self.overheard) > OVERHEARD_MAX:
             del self.overheard[next(iter(self.overheard))]
 
-    def heard_on(self, robot: Address, now: float) -> str | None:
+    def heard_on(self, robot: Address) -> str | None:
         """The link of ours on which a robot of another broker was overheard of late."""
         known = self.overheard.get(robot)
-        return known.way.link if known is not None and now - known.at <= RECENT_S else None
+        return None if known is None else known.way.link
 
     def recent(self, robot: Address, now: float) -> Overheard | None:
         """What was overheard of a robot, if that is recent enough to take it over."""
@@ -138,8 +138,7 @@ class Ownership:
             return self._shared(route.robot, rival, better_by, now)
         if rival.asked_at is None:
             rival.asked_at, rival.key = now, key
-        heard_between = route.heard_at is not None and rival.strange_at is not None and route.heard_at > rival.strange_at
-        if heard_between or rival.strange_at is None:
+        if rival.strange_at is None or (route.heard_at is not None and route.heard_at > rival.strange_at):
             self._alternated(route, broker, rival, now)
         rival.strange_at = now
         return False
@@ -159,9 +158,12 @@ class Ownership:
     def expire(self, now: float) -> None:
         """Forget what is long past."""
         for key, rival in list(self._rivals.items()):
-            if rival.strange_at is None or now - rival.strange_at > ALTERNATIONS_WITHIN_S:
-                if rival.better_since is None and rival.asked_at is None:
-                    del self._rivals[key]
+            strange = rival.strange_at is not None and now - rival.strange_at <= ALTERNATIONS_WITHIN_S
+            if not strange and rival.better_since is None and rival.asked_at is None:
+                del self._rivals[key]
+        for robot, known in list(self.overheard.items()):
+            if now - known.at > RECENT_S:
+                del self.overheard[robot]
         for robot, conflict in list(self.conflicts.items()):
             if now - conflict.last > CONFLICT_KEPT_S:
                 del self.conflicts[robot]

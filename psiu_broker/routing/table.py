@@ -81,8 +81,7 @@ class Table:
         """
         route = self.routes.get(address)
         if route is None:
-            if len(self.routes) >= self._capacity:
-                self._withdraw([next(route for route in self.routes.values() if not route.pinned)], now)
+            self._make_room(now)
             route = Route((address,), way, protocol, pinned=False)
             self._enter(route)
             self._departed.pop(address, None)
@@ -95,6 +94,28 @@ class Table:
         if route.first_heard is None:
             route.first_heard = now
         return route
+
+    def place(self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float) -> Route | None:
+        """Note where another broker says that a robot is; None where the configuration keeps it here."""
+        free = tuple(each for each in addresses if not self._is_pinned(each))
+        if addresses[0] not in free:
+            return None
+        route = self.routes.get(addresses[0])
+        if route is None or route.addresses != free:
+            self._withdraw(list({id(old): old for each in free if (old := self.routes.get(each))}.values()), now)
+            self._make_room(now)
+            route = Route(free, way, protocol, pinned=False)
+            self._enter(route)
+        route.way = way
+        route.protocol = protocol
+        route.heard_at = None
+        for address in free:
+            self._departed.pop(address, None)
+        return route
+
+    def withdraw(self, route: Route, now: float) -> None:
+        """Give up a learned route."""
+        self._withdraw([route], now)
 
     def forget_link(self, link: str, now: float) -> None:
         """Withdraw what was learned on `link`; pinned routes stay, to say that their link is down."""
@@ -117,6 +138,14 @@ class Table:
 
     def departed(self, address: Address) -> Departed | None:
         return self._departed.get(address)
+
+    def _is_pinned(self, address: Address) -> bool:
+        route = self.routes.get(address)
+        return route is not None and route.pinned
+
+    def _make_room(self, now: float) -> None:
+        if len(self.routes) >= self._capacity:
+            self._withdraw([next(route for route in self.routes.values() if not route.pinned)], now)
 
     def _enter(self, route: Route) -> None:
         for address in route.addresses:

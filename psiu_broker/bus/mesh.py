@@ -1,0 +1,272 @@
+"""The mesh over Zenoh: tokens for what is announced, puts for what is said.
+
+    psiu/@mesh/broker/{name}/{epoch}/{zenoh id}/{edition}
+        token: a broker is there
+    psiu/@mesh/robot/{owner}/{epoch}/{robot}/{number}/{protocol}/{link}/{term}/{quality}/{age}/{edition}
+        token: a claim
+    psiu/@mesh/frame/{to}/{from}/{lane}      put: a frame for a robot of `to`
+    psiu/@mesh/beat/{from}                   put: JSON, `mesh.beat.Beat`
+    psiu/@mesh/notice/{to}                   put: JSON, `mesh.beat.Notice`
+
+Tokens vanish with their session: at once when it is closed or killed, within its lease (2 s) when
+the way to it is cut. The edition is new each time everything is declared anew, so that the new
+tokens are there before the old ones go.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Executor
+from typing import Any, Final
+
+import zenoh
+from pydantic import ValidationError
+
+from psiu_broker.bus.keys import Keys, chunk, robot, robot_chunk, text
+from psiu_broker.bus.session import JSON, Declared, Session, aside, plain
+from psiu_broker.frame import Address
+from psiu_broker.mesh.beat import Beat, Notice
+from psiu_broker.mesh.mesh import Mesh
+from psiu_broker.routing.claims import Claim
+from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE
+
+logger = logging.getLogger(__name__)
+
+RING: Final = 65_536
+TALK_RING: Final = 4096
+LINKED_EVERY_S: Final = 2.0
+NONE: Final = "-"
+
+PRIORITIES: Final[Mapping[int, Any]] = {
+    STOP_LANE: zenoh.Priority.REAL_TIME,
+    COMMAND_LANE: zenoh.Priority.INTERACTIVE_HIGH,
+    QUESTION_LANE: zenoh.Priority.INTERACTIVE_LOW,
+}
+"""Of frames between brokers; what is published for programs has DATA_LOW."""
+
+
+class ZenohMesh:
+    """Implements `mesh.MeshBus`; declarations are made in a thread of their own, in their order."""
+
+    def __init__(self, session: Session, keys: Keys, own: str, mesh: Mesh) -> None:
+        self.zenoh_id = session.zenoh_id
+        self.linked: Collection[str] = ()
+        """The Zenoh ids of those whom a link of ours leads to."""
+        self.failures = 0
+        """Puts that Zenoh refused."""
+        self._session = session
+        self._own = own
+        self._mesh = mesh
+        self._root = f"{keys.prefix}/@mesh"
+        self._presence = ""
+        self._edition = 0
+        self._tokens: dict[str, Declared] = {}
+        """By key without its edition; touched by the worker only."""
+        self._worker: Executor = session.worker("mesh")
+        self._anew: asyncio.Task[None] | None = None
+
+    @classmethod
+    async def open(cls, session: Session, keys: Keys, own: str, mesh: Mesh) -> "ZenohMesh":
+        """Hear other brokers from now on, and attach `mesh`.
+
+        Raises:
+            BusError: the session is closed or lost.
+        """
+        bus = cls(session, keys, own, mesh)
+        root, me, zenoh_session = bus._root, chunk(own), session.zenoh
+        ring = zenoh.handlers.RingChannel
+
+        def subscribe(what: str, size: int) -> Callable[[], Any]:
+            return lambda: zenoh_session.declare_subscriber(
+                f"{root}/{what}", ring(size), allowed_origin=zenoh.Locality.REMOTE
+            )
+
+        def watch(what: str) -> Callable[[], Any]:
+            return lambda: zenoh_session.liveliness().declare_subscriber(f"{root}/{what}", ring(RING), history=True)
+
+        now = time.monotonic
+        await session.serve(
+            subscribe(f"frame/{me}/*/*", RING), bus._frame, lambda it: mesh.frame_came(*it, now()), name="mesh-frames"
+        )
+        await session.serve(
+            subscribe(f"notice/{me}", TALK_RING), _notice, lambda it: mesh.notice_came(it, now()), name="mesh-notices"
+        )
+        await session.serve(
+            subscribe("beat/*", TALK_RING), _beat, lambda it: mesh.beat_came(it, now()), name="mesh-beats"
+        )
+        await session.serve(watch("broker/**"), bus._broker_token, lambda it: it(now()), name="mesh-brokers")
+        await session.serve(watch("robot/**"), bus._robot_token, lambda it: it(now()), name="mesh-robots")
+        mesh.attach(bus, now())
+        return bus
+
+    # mesh.MeshBus
+
+    def put_frame(self, to: str, lane: int, data: bytes) -> None:
+        key = f"{self._root}/frame/{chunk(to)}/{chunk(self._own)}/{lane}"
+        self._put(key, data, priority=PRIORITIES[lane], express=lane != QUESTION_LANE)
+
+    def put_beat(self, beat: Beat) -> None:
+        self._put(f"{self._root}/beat/{chunk(self._own)}", beat.model_dump_json(), priority=zenoh.Priority.DATA_HIGH)
+
+    def put_notice(self, to: str, notice: Notice) -> None:
+        self._put(f"{self._root}/notice/{chunk(to)}", notice.model_dump_json(), priority=zenoh.Priority.DATA_HIGH)
+
+    def announce(self, epoch: int) -> None:
+        self._presence = f"{self._root}/broker/{chunk(self._own)}/{epoch}/{self.zenoh_id}"
+        self._later(self._declare, self._presence)
+
+    def claim(self, claim: Claim) -> None:
+        self._later(self._declare, self._key(claim))
+
+    def withdraw(self, claim: Claim) -> None:
+        self._later(self._undeclare, self._key(claim))
+
+    def declare_anew(self) -> None:
+        if self._anew is None or self._anew.done():
+            self._later(self._declare_tokens_anew)
+            self._anew = asyncio.get_running_loop().create_task(self._session.declare_anew())
+
+    async def look(self) -> None:
+        """Renew `linked`."""
+
+        def ids() -> set[str]:
+            info = self._session.zenoh.info
+            return {str(each) for each in (*info.routers_zid(), *info.peers_zid())}
+
+        try:
+            self.linked = await aside(ids)
+        except zenoh.ZError as error:
+            logger.debug("the session cannot tell its links: %s", plain(error))
+
+    async def close(self) -> None:
+        """Nothing more is declared; before `Session.close`."""
+        self._mesh.detach(time.monotonic())
+        if self._anew is not None:
+            self._anew.cancel()
+            await asyncio.gather(self._anew, return_exceptions=True)
+
+    # Tokens, in the worker.
+
+    def _later(self, work: Callable[..., None], *arguments: object) -> None:
+        try:
+            self._worker.submit(self._guarded, work, *arguments)
+        except RuntimeError:  # the session is closed
+            logger.debug("the bus is closed: nothing more is announced")
+
+    def _guarded(self, work: Callable[..., None], *arguments: object) -> None:
+        try:
+            work(*arguments)
+        except BaseException as error:
+            if not self._session.panicked(error):
+                logger.warning("announcing: %s", plain(error))
+
+    def _declare(self, key: str) -> None:
+        if key not in self._tokens:
+            self._tokens[key] = self._session.zenoh.liveliness().declare_token(f"{key}/{self._edition}")
+
+    def _undeclare(self, key: str) -> None:
+        token = self._tokens.pop(key, None)
+        if token is not None:
+            token.undeclare()
+
+    def _declare_tokens_anew(self) -> None:
+        self._edition += 1
+        old = self._tokens
+        self._tokens = {}
+        for key in old:
+            self._declare(key)
+        for token in old.values():
+            token.undeclare()
+
+    def _key(self, claim: Claim) -> str:
+        number = NONE if claim.number is None else robot_chunk(claim.number)
+        age = NONE if claim.age_s is None else str(claim.age_s)
+        return (
+            f"{self._root}/robot/{chunk(self._own)}/{self._mesh.epoch}/{robot_chunk(claim.robot)}/{number}"
+            f"/{chunk(claim.protocol)}/{chunk(claim.link)}/{claim.term}/{claim.quality}/{age}"
+        )
+
+    # What arrives, in the readers' threads: None for what is not as it should be.
+
+    def _chunks(self, key: str, count: int) -> list[str] | None:
+        """The chunks behind ``psiu/@mesh/{word}/``, if there are so many."""
+        chunks = key[len(self._root) + 1 :].split("/")[1:]
+        return chunks if len(chunks) == count and "*" not in key else None
+
+    def _frame(self, sample: zenoh.Sample) -> tuple[str, int, bytes] | None:
+        chunks = self._chunks(str(sample.key_expr), 3)
+        if chunks is None or sample.kind != zenoh.SampleKind.PUT or chunks[2] not in _LANES:
+            return None
+        return text(chunks[1]), int(chunks[2]), sample.payload.to_bytes()
+
+    def _broker_token(self, sample: zenoh.Sample) -> Callable[[float], None] | None:
+        chunks = self._chunks(str(sample.key_expr), 4)
+        if chunks is None:
+            return None
+        name, epoch, zenoh_id = text(chunks[0]), int(chunks[1]), chunks[2]
+        edition = chunks[3]
+        if sample.kind == zenoh.SampleKind.PUT:
+            return lambda now: self._mesh.broker_came(name, epoch, zenoh_id, edition, now)
+        return lambda now: self._mesh.broker_went(name, epoch, edition, now)
+
+    def _robot_token(self, sample: zenoh.Sample) -> Callable[[float], None] | None:
+        chunks = self._chunks(str(sample.key_expr), 10)
+        if chunks is None:
+            return None
+        owner, epoch, name, number, protocol, link, term, quality, age = chunks[:9]
+        claim = Claim(
+            robot(name),
+            None if number == NONE else _number(number),
+            text(protocol),
+            text(link),
+            int(term),
+            min(max(int(quality), 0), 10),
+            None if age == NONE else int(age),
+        )
+        broker, life = text(owner), int(epoch)
+        if sample.kind == zenoh.SampleKind.PUT:
+            return lambda now: self._mesh.claimed(broker, life, claim, now)
+        return lambda now: self._mesh.unclaimed(broker, life, claim, now)
+
+    def _put(self, key: str, payload: bytes | str, *, priority: Any, express: bool = False) -> None:
+        try:
+            self._session.zenoh.put(
+                key,
+                payload,
+                encoding=JSON if isinstance(payload, str) else None,
+                priority=priority,
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=express,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+        except BaseException as error:
+            self.failures += 1
+            if not self._session.panicked(error):
+                logger.debug("to other brokers: %s", plain(error))
+
+
+_LANES: Final = frozenset(str(lane) for lane in PRIORITIES)
+
+
+def _number(chunk: str) -> Address:
+    address = robot(chunk)
+    if not address.is_numbered:
+        raise ValueError(f"{chunk} is no PSIU HEXA address")
+    return address
+
+
+def _beat(sample: zenoh.Sample) -> Beat | None:
+    try:
+        return Beat.model_validate_json(sample.payload.to_bytes())
+    except ValidationError as error:
+        logger.debug("a beat that is none: %s", error)
+        return None
+
+
+def _notice(sample: zenoh.Sample) -> Notice | None:
+    try:
+        return Notice.model_validate_json(sample.payload.to_bytes())
+    except ValidationError as error:
+        logger.debug("a notice that is none: %s", error)
+        return None

@@ -1,0 +1,43 @@
+"""What every broker tells every other a few times a second: that it lives, and when it heard of them."""
+
+from collections.abc import Hashable, Iterable
+from hashlib import blake2b
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Micros = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+class Beat(BaseModel):
+    """One beat. Times are microseconds of the steady clock of the broker that is named."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    broker: str = Field(min_length=1, max_length=255)
+    epoch: int = Field(ge=0, lt=2**64, description="which life of the broker this is")
+    sent_us: Micros = Field(description="by the sender's clock")
+    heard: dict[str, tuple[Micros, Micros]] = Field(
+        default={},
+        max_length=4096,
+        description="for each broker the `sent_us` of its last beat, and how long ago that came",
+    )
+    claims: str = Field(default="", max_length=64, description="the digest of what the sender claims")
+
+
+class Notice(BaseModel):
+    """To the owner of a robot: we hear it too. Without a frame: declare what you have anew, we do not see it all."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    broker: str = Field(min_length=1, max_length=255)
+    quality: int = Field(default=0, ge=0, le=10, description="of the link that heard it")
+    frame: str | None = Field(default=None, max_length=200_000, description="the frame's envelope, in hexadecimal")
+
+
+def digest(tokens: Iterable[Hashable]) -> str:
+    """A short text that is the same for the same tokens, whatever their order."""
+    made = blake2b(digest_size=8)
+    for text in sorted(map(repr, tokens)):
+        made.update(text.encode("utf-8", "surrogatepass"))
+    return made.hexdigest()

@@ -1,0 +1,507 @@
+"""The other brokers as one more way for frames: who is there, who owns which robot, and frames to and from them.
+
+A frame goes to the broker that owns its robot, and there to a link; never from broker to broker
+again, because Zenoh itself relays between brokers. What is known comes from announcements
+(`Claims`); the tick sets right whatever was missed, so a lost message costs time and nothing else.
+"""
+
+import logging
+import secrets
+from collections.abc import Callable, Hashable
+from math import inf
+from typing import Final, Protocol
+
+from psiu_broker.errors import EncodeError
+from psiu_broker.frame import MESH, Address, Frame, Way
+from psiu_broker.mesh.beat import Beat, Notice, digest
+from psiu_broker.mesh.envelope import Envelope, pack, unpack
+from psiu_broker.mesh.neighbour import BEAT_S, SILENT_S, Neighbour, Neighbours
+from psiu_broker.routing.claims import Claim, age_of
+from psiu_broker.routing.outbox import Fate, lane
+from psiu_broker.routing.ownership import Overheard, Ownership
+from psiu_broker.routing.router import Router
+from psiu_broker.routing.table import Route
+from psiu_broker.routing.verdicts import DELIVERED, DUPLICATE, LINK_DOWN, MALFORMED, REFUSED, Verdict
+
+log = logging.getLogger(__name__)
+
+MAX_AGE_S: Final = 2.0
+"""A frame that waited longer before it could be handed to another broker is not."""
+GIVEN_S: Final = 1.0
+"""How long a robot that we gave up may be without an owner before we look for it again."""
+ORPHANED_S: Final = 1.0
+"""How long a robot whose broker is gone may be without an owner before its card is deleted."""
+ANEW_EVERY_S: Final = 3.0
+DIFFERS_S: Final = 2.0
+NAMESAKE_S: Final = 3.0
+"""A broker of our name that is announced for longer than this is no former life of ours."""
+STRANGERS_MAX: Final = 256
+FORMER_MAX: Final = 1024
+
+
+NOTHING: Final = digest(())
+
+
+class Tokens:
+    """The tokens of one broker that are declared now: for a moment two for one robot, while a claim is renewed."""
+
+    __slots__ = ("_claims", "_digest")
+
+    def __init__(self) -> None:
+        self._claims: dict[Address, list[tuple[int, Claim]]] = {}
+        self._digest: str | None = None
+
+    @property
+    def digest(self) -> str:
+        if self._digest is None:
+            self._digest = digest({claim for held in self._claims.values() for _, claim in held})
+        return self._digest
+
+    def add(self, epoch: int, claim: Claim) -> None:
+        self._digest = None
+        self._claims.setdefault(claim.robot, []).append((epoch, claim))
+
+    def remove(self, epoch: int, claim: Claim) -> Claim | None:
+        """The claim that the broker still has for the robot."""
+        self._digest = None
+        held = self._claims.get(claim.robot, [])
+        if (epoch, claim) in held:
+            held.remove((epoch, claim))
+        if not held:
+            self._claims.pop(claim.robot, None)
+            return None
+        return held[-1][1]
+
+
+class MeshBus(Protocol):
+    """What the mesh needs of the bus. None of these waits or raises."""
+
+    zenoh_id: str
+
+    def put_frame(self, to: str, lane: int, data: bytes) -> None: ...
+    def put_beat(self, beat: Beat) -> None: ...
+    def put_notice(self, to: str, notice: Notice) -> None: ...
+    def announce(self, epoch: int) -> None:
+        """Say that we are there, in this life; before the first `claim`."""
+
+    def claim(self, claim: Claim) -> None: ...
+    def withdraw(self, claim: Claim) -> None: ...
+    def declare_anew(self) -> None:
+        """Declare everything once more, for brokers that have lost sight of it."""
+
+
+class _NoBus:
+    """In the bus's place while there is none."""
+
+    zenoh_id = ""
+
+    def put_frame(self, to: str, lane: int, data: bytes) -> None: ...
+    def put_beat(self, beat: Beat) -> None: ...
+    def put_notice(self, to: str, notice: Notice) -> None: ...
+    def announce(self, epoch: int) -> None: ...
+    def claim(self, claim: Claim) -> None: ...
+    def withdraw(self, claim: Claim) -> None: ...
+    def declare_anew(self) -> None: ...
+
+
+class Hub(Protocol):
+    """The broker's side of the mesh."""
+
+    def relayed(self, frame: Frame, way: Way, now: float, age_s: float) -> object:
+        """A frame came from another broker; `age_s` is how long ago its robot sent it, as far as is known."""
+
+    def relay_dropped(self, verdict: Verdict) -> None:
+        """Something came from another broker that is no frame for us."""
+
+    def neighbour_came(self, name: str) -> None: ...
+
+    def orphaned(self, robot: Address) -> None:
+        """The robot's broker is gone, nobody else has it, and it is ours to say so."""
+
+
+class Mesh:
+    """Stands among the links as `MESH`: its far ends are the other brokers, by name.
+
+    Args:
+        own: this broker's name.
+        quality: of a link, in tenths of what is heard that check out.
+        identity: as the router's.
+    """
+
+    def __init__(
+        self,
+        own: str,
+        hub: Hub,
+        router: Router,
+        ownership: Ownership,
+        neighbours: Neighbours,
+        quality: Callable[[str], int],
+        identity: Callable[[Frame], Hashable],
+    ) -> None:
+        self.own = own
+        self.ownership = ownership
+        self.claims = ownership.claims
+        self.neighbours = neighbours
+        self.epoch = 0
+        self.declared_anew = 0
+        self.namesakes: dict[int, float] = {}
+        """Other brokers with our name: their epochs, and since when."""
+        self._hub = hub
+        self._router = router
+        self._quality = quality
+        self._identity = identity
+        self._bus: MeshBus = _NoBus()
+        self._attached = False
+        self._former: dict[tuple[str, int], Neighbour] = {}
+        """Brokers that went, by name and life: if they were only out of sight, the series go on."""
+        self._tokens: dict[str, Tokens] = {}
+        self._given: dict[Address, float] = {}
+        self._orphans: dict[Address, float] = {}
+        self._strangers: dict[str, float] = {}
+        self._beaten = -inf
+        self._anew_at = -inf
+
+    # The bus comes and goes.
+
+    def attach(self, bus: MeshBus, now: float) -> None:
+        """A session is open: begin a new life on it."""
+        self._bus = bus
+        self._attached = True
+        self.epoch = secrets.randbits(64)
+        self._anew_at = now
+        bus.announce(self.epoch)
+        self.tick(now)
+
+    def detach(self, now: float) -> None:
+        """The session is gone, and with it everybody."""
+        self._bus = _NoBus()
+        self._attached = False
+        for neighbour in list(self.neighbours):
+            self._lose(neighbour, now)
+        for robot in self.claims.of(self.own):
+            self.claims.remove(self.own, robot)
+        self._tokens.clear()
+        self._orphans.clear()
+        self.namesakes.clear()
+
+    # As a link.
+
+    def ways(self) -> tuple[Way, ...]:
+        return self.neighbours.ways
+
+    def offer(
+        self, frame: Frame, peer: object, arrived: Way, now: float, patience_s: float = inf, fate: Fate | None = None
+    ) -> Verdict | None:
+        """Hand `frame` to the broker `peer`; like `Link.offer`, but nothing ever waits."""
+        neighbour = self.neighbours.find(str(peer))
+        if neighbour is None:
+            return LINK_DOWN
+        waited_s = 0.0 if patience_s == inf else MAX_AGE_S - patience_s
+        urgency = lane(frame)
+        try:
+            data = self._packed(frame, neighbour, neighbour.sent.get(urgency, 0) + 1, now, waited_s)
+        except EncodeError as error:
+            log.debug("to broker %s: %s", neighbour.name, error)
+            return REFUSED
+        neighbour.number(urgency)
+        self._bus.put_frame(neighbour.name, urgency, data)
+        return DELIVERED
+
+    # What the bus brings.
+
+    def broker_came(self, name: str, epoch: int, zenoh_id: str, edition: str, now: float) -> None:
+        """A broker is announced; `edition` tells its announcements apart where there is more than one."""
+        if name == self.own:
+            if epoch != self.epoch:
+                self.namesakes[epoch] = now
+            return
+        known = self.neighbours.find(name)
+        if known is not None:
+            if known.epoch == epoch:
+                known.editions.add(edition)
+                return
+            self._lose(known, now)
+        neighbour = self._former.pop((name, epoch), None)
+        if neighbour is None:
+            neighbour = Neighbour(name, epoch, zenoh_id, now)
+        else:
+            neighbour.returned(now)
+        neighbour.editions = {edition}
+        self.neighbours.add(neighbour)
+        self._router.announced((Address.named(name),), neighbour.way, "psiu-ascii", now)
+        self._hub.neighbour_came(name)
+        self._beaten = -inf
+        log.info("mesh: broker %s is there", name)
+
+    def broker_went(self, name: str, epoch: int, edition: str, now: float) -> None:
+        """An announcement is no more; with its last one the broker is gone."""
+        self.namesakes.pop(epoch, None)
+        neighbour = self.neighbours.find(name)
+        if neighbour is not None and neighbour.epoch == epoch:
+            neighbour.editions.discard(edition)
+            if not neighbour.editions:
+                self._lose(neighbour, now)
+
+    def _lose(self, neighbour: Neighbour, now: float) -> None:
+        name = neighbour.name
+        self.neighbours.remove(name)
+        self._former[name, neighbour.epoch] = neighbour
+        if len(self._former) > FORMER_MAX:
+            del self._former[next(iter(self._former))]
+        self._tokens.pop(name, None)
+        self._router.peer_lost(neighbour.way, now)
+        for robot in self.claims.remove_broker(name):
+            self._orphans[robot] = now
+            self._settle(robot, now)
+        log.info("mesh: broker %s is gone", name)
+
+    def claimed(self, broker: str, epoch: int, claim: Claim, now: float) -> None:
+        if broker == self.own:
+            return
+        self._tokens.setdefault(broker, Tokens()).add(epoch, claim)
+        if self.claims.set(broker, claim):
+            self._settle(claim.robot, now)
+
+    def unclaimed(self, broker: str, epoch: int, claim: Claim, now: float) -> None:
+        if broker == self.own:
+            return
+        tokens = self._tokens.get(broker)
+        rest = None if tokens is None else tokens.remove(epoch, claim)
+        if rest is not None:
+            self.claims.set(broker, rest)
+        else:
+            self.claims.remove(broker, claim.robot)
+        self._settle(claim.robot, now)
+
+    def frame_came(self, sender: str, urgency: int, data: bytes, now: float) -> None:
+        envelope = unpack(data)
+        neighbour = self.neighbours.find(sender)
+        if envelope is None:
+            self._hub.relay_dropped(MALFORMED)
+        elif neighbour is None or (envelope.epoch, envelope.to_epoch) != (neighbour.epoch, self.epoch):
+            self._hub.relay_dropped(REFUSED)
+        elif not neighbour.take(urgency, envelope.sequence):
+            self._hub.relay_dropped(DUPLICATE)
+        else:
+            age_s = envelope.age_ms / 1000 + neighbour.late_s(envelope.sent_us, now)
+            self._hub.relayed(envelope.frame, neighbour.way, now, age_s)
+
+    def beat_came(self, beat: Beat, now: float) -> None:
+        neighbour = self.neighbours.find(beat.broker)
+        if neighbour is None or neighbour.epoch != beat.epoch:
+            if beat.broker != self.own:
+                self._stranger(beat.broker, now)
+            return
+        self._strangers.pop(beat.broker, None)
+        neighbour.beat(beat, self.own, now)
+        tokens = self._tokens.get(beat.broker)
+        if beat.claims == (tokens.digest if tokens is not None else NOTHING):
+            neighbour.differs_since = None
+        elif neighbour.differs_since is None:
+            neighbour.differs_since = now
+
+    def notice_came(self, notice: Notice, now: float) -> None:
+        if notice.frame is None:
+            self._declare_anew(now, f"{notice.broker} does not see all of it")
+            return
+        try:
+            envelope = unpack(bytes.fromhex(notice.frame))
+        except ValueError:
+            envelope = None
+        neighbour = self.neighbours.find(notice.broker)
+        if envelope is None or neighbour is None:
+            return
+        route = self._router.find(envelope.frame.source)
+        if route is None or self.claims.find(self.own, route.robot) is None:
+            return
+        better_by = notice.quality - self._quality(route.way.link)
+        if self.ownership.noticed(route, notice.broker, self._identity(envelope.frame), better_by, now):
+            self._give(route, notice.broker, now)
+
+    # What the broker tells us.
+
+    def robot_heard(self, route: Route, now: float) -> None:
+        """A robot was heard on one of our links, for the first time or after it moved there."""
+        if route.way.link != MESH and self._attached:
+            self._given.pop(route.robot, None)
+            self._announce(route, now, news=True)
+
+    def robot_gone(self, route: Route) -> None:
+        """The route to a robot was withdrawn."""
+        claim = self.claims.find(self.own, route.robot)
+        if claim is not None:
+            self._unclaim(claim)
+
+    def notify(self, owner: str, frame: Frame, arrived: Way, now: float) -> None:
+        """Tell the owner of a robot that we heard this frame of it."""
+        neighbour = self.neighbours.find(owner)
+        if neighbour is not None:
+            try:
+                data = self._packed(frame, neighbour, 0, now, 0.0)
+            except EncodeError:
+                return
+            notice = Notice(broker=self.own, quality=self._quality(arrived.link), frame=data.hex())
+            self._bus.put_notice(owner, notice)
+
+    def tick(self, now: float) -> None:
+        """To be called some ten times a second."""
+        if not self._attached:
+            return
+        for robot, broker in list(self.ownership.due(self._router.find, now)):
+            route = self._router.find(robot)
+            if route is not None and self.claims.find(self.own, robot) is not None:
+                self._give(route, broker, now)
+        if now - self._beaten >= BEAT_S:
+            self._beaten = now
+            self._beat(now)
+            self._set_right(now)
+            self._guard(now)
+
+    # Inside.
+
+    def _packed(self, frame: Frame, neighbour: Neighbour, number: int, now: float, waited_s: float) -> bytes:
+        age_ms = int(max(waited_s, 0.0) * 1000)
+        return pack(Envelope(self.epoch, neighbour.epoch, number, int(now * 1e6), age_ms, frame))
+
+    def _beat(self, now: float) -> None:
+        heard = {each.name: echo for each in self.neighbours if (echo := each.echo(now)) is not None}
+        claims = digest(self.claims.of(self.own).values())
+        self._bus.put_beat(Beat(broker=self.own, epoch=self.epoch, sent_us=int(now * 1e6), heard=heard, claims=claims))
+
+    def _settle(self, robot: Address, now: float) -> None:
+        """Bring the route to `robot` in line with who claims it."""
+        held = self.claims.owner(robot)
+        if held is None:
+            overheard = self.ownership.recent(robot, now)
+            if overheard is not None:
+                self._router.take(robot, overheard.way, overheard.protocol, now)
+            elif robot not in self._given:
+                self._router.unannounced(robot, now)
+            return
+        owner, claim = held
+        if owner == self.own:
+            return
+        self._given.pop(robot, None)
+        self._orphans.pop(robot, None)
+        mine = self.claims.find(self.own, robot)
+        if mine is not None:
+            self._unclaim(mine)
+            self._remember(self._router.find(robot), now)
+        neighbour = self.neighbours.find(owner)
+        if neighbour is not None:
+            self._router.announced(claim.addresses, neighbour.way, claim.protocol, now)
+
+    def _give(self, route: Route, broker: str, now: float) -> None:
+        """Give up a robot that moved to another broker, which takes it when it sees that."""
+        robot = route.robot
+        mine = self.claims.find(self.own, robot)
+        neighbour = self.neighbours.find(broker)
+        if mine is None or neighbour is None:
+            return
+        log.info("mesh: %s goes to %s", robot, broker)
+        self._unclaim(mine)
+        self._remember(route, now)
+        self._given[robot] = now
+        self._router.announced(route.addresses, neighbour.way, route.protocol, now)
+
+    def _remember(self, route: Route | None, now: float) -> None:
+        """What was ours a moment ago, so that it can be again."""
+        if route is not None and route.way.link != MESH and route.heard_at is not None:
+            self.ownership.overheard[route.robot] = Overheard(route.way, route.protocol, route.heard_at, now)
+
+    def _announce(self, route: Route, now: float, *, news: bool = False) -> None:
+        """Claim a robot of one of our links, or renew the claim where it has changed."""
+        robot = route.robot
+        mine = self.claims.find(self.own, robot)
+        held = self.claims.owner(robot)
+        if not self._attached or robot in self._given:
+            return
+        taken = held is not None and held[0] != self.own
+        if taken and not news and not self._heard_since_lost(route, now):
+            return
+        heard = route.heard_at is not None
+        term = mine.term if mine is not None and (mine.term > 0 or not heard) else 0
+        if heard and (term == 0 or taken):
+            term = self.claims.next_term(robot)
+        quality = self._quality(route.way.link)
+        if mine is not None and abs(quality - mine.quality) < 2:
+            quality = mine.quality
+        number = next((each for each in route.addresses[1:] if each.is_numbered), None)
+        age_s = age_of(route.heard_at, now)
+        claim = Claim(robot, number, route.protocol, route.way.link, term, quality, age_s)
+        if claim == mine:
+            return
+        self.claims.set(self.own, claim)
+        self._bus.claim(claim)
+        if mine is not None:
+            self._bus.withdraw(mine)
+
+    def _heard_since_lost(self, route: Route, now: float) -> bool:
+        """Whether a robot that the configuration keeps here, and another broker claims, was heard here after all."""
+        if route.heard_at is None or now - route.heard_at > 2 * BEAT_S:
+            return False
+        known = self.ownership.overheard.get(route.robot)
+        return known is None or route.heard_at > known.at
+
+    def _unclaim(self, claim: Claim) -> None:
+        self.claims.remove(self.own, claim.robot)
+        self._bus.withdraw(claim)
+
+    def _set_right(self, now: float) -> None:
+        """Whatever a lost message left wrong."""
+        self.ownership.expire(now)
+        for robot, since in list(self._given.items()):
+            if now - since > GIVEN_S:
+                del self._given[robot]
+                self._settle(robot, now)
+        for route in list(self._router.table):
+            if route.way.link == MESH:
+                if self.neighbours.find(str(route.robot)) is None and route.robot not in self._given:
+                    self._settle(route.robot, now)
+            elif route.way.link in self._router.ports:
+                self._announce(route, now)
+        for robot, claim in self.claims.of(self.own).items():
+            found = self._router.find(robot)
+            if found is None or found.way.link == MESH:
+                self._unclaim(claim)
+        self._tell_orphans(now)
+
+    def _tell_orphans(self, now: float) -> None:
+        """One of the brokers that are left says that a robot is gone with its broker."""
+        for robot, since in list(self._orphans.items()):
+            if now - since > ORPHANED_S:
+                del self._orphans[robot]
+                first = all(self.own < neighbour.name for neighbour in self.neighbours)
+                if first and self.claims.owner(robot) is None and self._router.find(robot) is None:
+                    self._hub.orphaned(robot)
+
+    def _guard(self, now: float) -> None:
+        """Notice who has lost sight of us, or we of them: Zenoh's routers do, and do not mend it."""
+        for neighbour in self.neighbours:
+            if now - neighbour.last_sign() > SILENT_S:
+                self._declare_anew(now, f"{neighbour.name} is announced and silent")
+            elif neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
+                self._declare_anew(now, f"{neighbour.name} does not hear us")
+            if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
+                self._ask_anew(neighbour.name)
+                neighbour.differs_since = now
+        for name, since in list(self._strangers.items()):
+            if now - since > SILENT_S:
+                del self._strangers[name]
+                self._ask_anew(name)
+
+    def _stranger(self, name: str, now: float) -> None:
+        """A beat of a broker that is not announced to us."""
+        if len(self._strangers) < STRANGERS_MAX:
+            self._strangers.setdefault(name, now)
+
+    def _ask_anew(self, name: str) -> None:
+        log.info("mesh: asking %s to declare anew what it has", name)
+        self._bus.put_notice(name, Notice(broker=self.own))
+
+    def _declare_anew(self, now: float, why: str) -> None:
+        if now - self._anew_at >= ANEW_EVERY_S:
+            self._anew_at = now
+            self.declared_anew += 1
+            log.warning("mesh: declaring everything anew: %s", why)
+            self._bus.declare_anew()

@@ -1,0 +1,139 @@
+"""What one broker knows of another: whether it lives, how far it is, and what came of each other's frames."""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Final
+
+from psiu_broker.frame import MESH, Way
+from psiu_broker.mesh.beat import Beat
+from psiu_broker.routing.sequence import Sequence
+
+BEAT_S: Final = 0.4
+ALIVE_S: Final = 1.2
+"""A broker whose last beat is older may be gone: its robots are anybody's who hears them."""
+SILENT_S: Final = 2.2
+"""A broker that is announced and yet so long silent does not know of us: we declare everything anew."""
+OFFSETS: Final = 64
+ROUND_TRIPS: Final = 8
+
+
+class Neighbour:
+    """Another broker, in one of its lives (`epoch`)."""
+
+    def __init__(self, name: str, epoch: int, zenoh_id: str, now: float) -> None:
+        self.name = name
+        self.epoch = epoch
+        self.zenoh_id = zenoh_id
+        self.way = Way(MESH, name)
+        self.since = now
+        self.beat_at: float | None = None
+        self.deaf_since: float | None = None
+        """Since when its beats do not mention ours."""
+        self.differs_since: float | None = None
+        """Since when what it says that it claims is not what we have seen announced."""
+        self.sent: dict[int, int] = {}
+        """How many frames we sent it, by lane."""
+        self.received: dict[int, Sequence] = {}
+        self.doubles = 0
+        self.editions: set[str] = set()
+        """Its announcements that stand."""
+        self._sent_us = 0
+        self._offsets: deque[float] = deque(maxlen=OFFSETS)
+        self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)
+
+    def alive(self, now: float) -> bool:
+        return now - self.last_sign() <= ALIVE_S
+
+    def last_sign(self) -> float:
+        return self.since if self.beat_at is None else self.beat_at
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """The quickest of the last few."""
+        return min(self._round_trips) if self._round_trips else None
+
+    @property
+    def frames_out(self) -> int:
+        return sum(self.sent.values())
+
+    @property
+    def frames_in(self) -> int:
+        return sum(series.received for series in self.received.values())
+
+    @property
+    def lost(self) -> int:
+        return sum(series.lost for series in self.received.values())
+
+    def returned(self, now: float) -> None:
+        """It was only out of sight, and the series of frames go on."""
+        self.since = now
+        self.beat_at = self.deaf_since = self.differs_since = None
+
+    def beat(self, beat: Beat, own: str, now: float) -> None:
+        """Note a beat that came now."""
+        self.beat_at = now
+        self._sent_us = beat.sent_us
+        self._offsets.append(now - beat.sent_us / 1e6)
+        echo = beat.heard.get(own)
+        if echo is None:
+            self.deaf_since = now if self.deaf_since is None else self.deaf_since
+        else:
+            self.deaf_since = None
+            ours_us, held_us = echo
+            round_trip_s = now - (ours_us + held_us) / 1e6
+            if 0 <= round_trip_s < SILENT_S:
+                self._round_trips.append(round_trip_s)
+
+    def echo(self, now: float) -> tuple[int, int] | None:
+        """What our own beat says of this broker's."""
+        return None if self.beat_at is None else (self._sent_us, int((now - self.beat_at) * 1e6))
+
+    def late_s(self, sent_us: int, now: float) -> float:
+        """How much longer than the quickest beat a frame took; the clocks of two brokers may differ at will."""
+        offset = now - sent_us / 1e6
+        quickest = min(self._offsets, default=offset)
+        return max(offset - quickest, 0.0)
+
+    def number(self, lane: int) -> int:
+        """The place of the next frame to it in the series of `lane`."""
+        self.sent[lane] = number = self.sent.get(lane, 0) + 1
+        return number
+
+    def take(self, lane: int, number: int) -> bool:
+        """Note a frame from it; False for one that came before."""
+        series = self.received.get(lane)
+        if series is None:
+            series = self.received[lane] = Sequence()
+        new = series.take(number)
+        self.doubles += not new
+        return new
+
+
+class Neighbours:
+    """The other brokers that are announced now, by name."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Neighbour] = {}
+        self.ways: tuple[Way, ...] = ()
+
+    def __iter__(self) -> Iterator[Neighbour]:
+        return iter(self._known.values())
+
+    def find(self, name: str) -> Neighbour | None:
+        return self._known.get(name)
+
+    def add(self, neighbour: Neighbour) -> None:
+        """A broker, or a new life of one that was known."""
+        self._known[neighbour.name] = neighbour
+        self._count()
+
+    def remove(self, name: str) -> None:
+        self._known.pop(name, None)
+        self._count()
+
+    def alive(self, name: str, now: float) -> bool:
+        neighbour = self._known.get(name)
+        return neighbour is not None and neighbour.alive(now)
+
+    def _count(self) -> None:
+        self.ways = tuple(neighbour.way for neighbour in self._known.values())
