@@ -10,14 +10,15 @@ its commands from a new port: among them the window is `same_link_s`.
 """
 
 from collections.abc import Hashable
+from math import inf
 
-from psiu_broker.frame import Way
+from psiu_broker.frame import MESH, Way
 
 
 class Duplicates:
     """Remembers each frame for at least `window_s`, in two generations so that forgetting costs nothing."""
 
-    __slots__ = ("_capacity", "_new", "_old", "_same_link_s", "_since", "_window_s")
+    __slots__ = ("_capacity", "_new", "_old", "_same_link_s", "_until", "_window_s")
 
     def __init__(self, window_s: float = 4.0, same_link_s: float = 0.25, *, capacity: int = 16_384) -> None:
         self._window_s = window_s
@@ -25,18 +26,41 @@ class Duplicates:
         self._capacity = capacity
         self._new: dict[Hashable, tuple[Way, float]] = {}
         self._old: dict[Hashable, tuple[Way, float]] = {}
-        self._since = float("-inf")
+        self._until = -inf
+        """When the new generation becomes the old one."""
 
     def is_double(self, key: Hashable, way: Way, now: float) -> bool:
         """Note the frame `key` heard on `way`; True if it came by another way less than the window ago."""
-        if now - self._since > self._window_s or len(self._new) >= self._capacity:
+        if now > self._until:
             self._old = self._new
             self._new = {}
-            self._since = now
-        seen = self._new.get(key) or self._old.get(key)
-        if seen is not None and seen[0] != way:
-            window_s = self._same_link_s if seen[0].link == way.link else self._window_s
-            if now - seen[1] <= window_s:
+            self._until = now + self._window_s
+        new = self._new
+        hearing = (way, now)
+        seen = new.setdefault(key, hearing)
+        if seen is hearing:
+            before = self._old.get(key)
+            if before is not None and self._is_another(before, way, now):
+                del new[key]
                 return True
-        self._new[key] = (way, now)
+            if len(new) >= self._capacity:
+                self._until = -inf
+        elif seen[0] is not way and self._is_another(seen, way, now):
+            if seen[0].link == MESH:
+                new[key] = (way, seen[1])  # quicker by another broker, and ours all the same: our link leads
+            return True
+        else:
+            new[key] = hearing
         return False
+
+    def heard_here(self, key: Hashable) -> bool:
+        """Whether a link of ours, and not only another broker, brought the frame `key`."""
+        seen = self._new.get(key) or self._old.get(key)
+        return seen is not None and seen[0].link != MESH
+
+    def _is_another(self, seen: tuple[Way, float], way: Way, now: float) -> bool:
+        """Whether what was `seen` came by another way than `way`, and so lately that this is its double."""
+        if seen[0] == way:
+            return False
+        window_s = self._same_link_s if seen[0].link == way.link else self._window_s
+        return now - seen[1] <= window_s

@@ -60,6 +60,28 @@ def test_the_memory_survives_a_change_of_generation() -> None:
     assert duplicates.is_double(b"frame", WIFI, 1.5)
 
 
+def test_a_double_does_not_count_as_heard() -> None:
+    duplicates = Duplicates(1.0)
+    duplicates.is_double(b"other", RADIO, 0.0)
+    duplicates.is_double(b"frame", RADIO, 0.9)
+    assert duplicates.is_double(b"frame", WIFI, 1.1)
+    assert duplicates.is_double(b"frame", WIFI, 1.2)
+    assert not duplicates.is_double(b"frame", RADIO, 1.3)
+    assert not duplicates.is_double(b"frame", WIFI, 2.4)
+
+
+def test_a_full_memory_forgets_its_older_half_only() -> None:
+    duplicates = Duplicates(1.0, capacity=100)
+    for number in range(150):
+        duplicates.is_double(number, RADIO, 0.0)
+    assert all(duplicates.is_double(number, WIFI, 0.5) for number in range(150))
+    for number in range(150, 200):
+        assert not duplicates.is_double(number, RADIO, 0.5)
+    assert not duplicates.is_double(200, RADIO, 0.5)
+    assert not duplicates.is_double(0, WIFI, 0.5)
+    assert duplicates.is_double(100, WIFI, 0.5)
+
+
 def test_memory_is_bounded_under_a_flood_of_different_frames() -> None:
     duplicates = Duplicates(1.0, capacity=100)
     for number in range(10_000):
