@@ -123,6 +123,15 @@ async def test_a_frame_heard_reaches_the_hub_with_its_way(hub: Hub) -> None:
     assert way == Way("radio")
 
 
+async def test_a_frame_counts_alike_alone_and_among_others(hub: Hub) -> None:
+    link = connected(hub, MemoryTransport(), clock=lambda: 5.0)
+    for data in (COMMAND, COMMAND, COMMAND[:10], COMMAND[10:], COMMAND + COMMAND):
+        link.received(data, None)
+    assert (link.frames_in, link.last_heard, link.malformed) == (5, 5.0, 0)
+    assert len(hub.frames) == 5
+    assert len(set(hub.frames)) == 1
+
+
 async def test_an_offered_frame_leaves_whole_at_once(hub: Hub) -> None:
     transport = MemoryTransport()
     link = connected(hub, transport)

@@ -2,9 +2,9 @@
 
 import functools
 import operator
-import zlib
 from collections.abc import Callable, Mapping
 from typing import Final, Literal
+from zlib import adler32
 
 Check = Callable[[bytes], int]
 """What makes one byte, 0–255, of any bytes before it."""
@@ -18,7 +18,7 @@ def byte_sum(data: bytes) -> int:
     """The sum of all bytes, modulo 65536 (PSIU ASCII, CheckSum)."""
     if len(data) <= _ADLER_EXACT:
         # The low half of Adler-32 is 1 + the sum modulo 65521, which so few bytes cannot reach; half the time of sum().
-        return (zlib.adler32(data) & 0xFFFF) - 1
+        return (adler32(data) & 0xFFFF) - 1
     return sum(data) & 0xFFFF
 
 

@@ -41,6 +41,13 @@ class Codec(ABC):
     def __init__(self, options: Any, directory: Directory) -> None:
         """`options` is an instance of this class's `Options`."""
 
+    def whole(self, data: bytes) -> Frame | None:
+        """The frame, if `data` is exactly one, of a kind that this codec can tell at a glance; None: `decode` it.
+
+        Only for when nothing is `pending`. What it tells is what `decode` would; it changes nothing.
+        """
+        return None
+
     @abstractmethod
     def decode(self, data: bytes, now: float) -> Sequence[Event]:
         """Take the next bytes of the stream; return what they complete, in order. Never raises."""

@@ -110,14 +110,34 @@ class PsiuAscii(Codec):
         self._run = Run(strict=options.strict)
         self._noise = Noise()
 
+    def whole(self, data: bytes) -> Frame | None:
+        """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case."""
+        try:
+            destination, size, rest = data.split(b" ", 2)
+            if size != _SIZES[len(data)]:
+                is_line = data.endswith(b"\r\n") and size == _SIZES[len(data) - 2]
+                return self.whole(data[:-2]) if is_line else None
+            payload, source, checksum = rest.rsplit(b" ", 2)
+            if checksum != _CHECKSUMS[byte_sum(data[:-5])]:
+                return None
+            command, _, parameters = payload.partition(b" ")
+            subject = self._subjects[command]
+            to = self._names[destination]
+            sender = self._names[source]
+        except (ValueError, LookupError):  # a part is missing, too long, or a word not heard before
+            return None
+        # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
+        if not parameters.isalnum() and parameters.translate(None, _PRINTABLE_BYTES):
+            return None
+        if self._directory.names and self._may_begin_a_name(payload + b" " + source):
+            return None
+        return _make(Frame, (sender, to, subject, payload, PROTOCOL, data, _CANONICAL, ""))
+
     def decode(self, data: bytes, now: float) -> Sequence[Event]:
         """The frames that `data` completes, and in one `Malformed` each run of bytes between them."""
-        if not self.pending:
-            frame = self._whole(data)
-            if frame is not None:
-                return [frame]
         events: list[Event] = []
-        for piece in _PIECE.finditer(data):
+        rest = 0 if self.pending else self._take_whole(data, events)
+        for piece in _PIECE.finditer(data, rest):
             if piece[1] is not None:
                 for at in range(piece.start(), piece.end(), _STEP):
                     self._read(data[at : min(at + _STEP, piece.end())], events)
@@ -162,29 +182,21 @@ class PsiuAscii(Codec):
         summed = destination + b" %b " % _SIZES[size] + body
         return b"%b%05d" % (summed, byte_sum(summed))
 
-    def _whole(self, data: bytes) -> Frame | None:
-        """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case."""
-        if data[-2:] == b"\r\n":
-            data = data[:-2]
-        try:
-            destination, size, rest = data.split(b" ", 2)
-            payload, source, checksum = rest.rsplit(b" ", 2)
-        except ValueError:
-            return None
-        length = len(data)
-        if length > LONGEST or size != _SIZES[length] or checksum != _CHECKSUMS[byte_sum(data[:-5])]:
-            return None
-        subject = self._subjects.get(payload.partition(b" ")[0])
-        to = self._names.get(destination)
-        sender = self._names.get(source)
-        if subject is None or to is None or sender is None:
-            return None
-        # Only the parameters were not looked at before; and a known name with spaces may begin with one of them.
-        if payload.translate(None, _PRINTABLE_BYTES):
-            return None
-        if self._directory.names and self._may_begin_a_name(payload + b" " + source):
-            return None
-        return _make(Frame, (sender, to, subject, payload, PROTOCOL, data, _CANONICAL, ""))
+    def _take_whole(self, data: bytes, events: list[Event]) -> int:
+        """Take the `whole` frames that `data` begins with; where the rest begins.
+
+        However the stream is cut, the frames are the same: it is cut here where each says that it ends.
+        """
+        start = 0
+        while True:
+            field = data.find(b" ", start) + 1
+            size = data[field : field + 3]
+            end = start + int(size) if field and size.isdigit() else len(data) + 1
+            frame = self.whole(data[start:end]) if end <= len(data) else None
+            if frame is None:
+                return start
+            events.append(frame)
+            start = end
 
     def _may_begin_a_name(self, message: bytes) -> bool:
         """Whether a known name with spaces is at the end of `message`, behind its command word."""

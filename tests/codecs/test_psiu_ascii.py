@@ -198,6 +198,14 @@ def test_half_a_frame_is_given_up_by_silence() -> None:
     assert [frame.wire for frame in frames(read(codec, FRAME))] == [FRAME]
 
 
+@pytest.mark.parametrize("parameters", [b"1\x1f0", b"1\x7f0", b"1\xb20", b"\xe9\xe9\xe9", b"1\n0"])
+def test_no_frame_with_a_byte_that_is_not_printable_is_told_at_a_glance(parameters: bytes) -> None:
+    codec = ascii_codec()
+    read(codec, FRAME)
+    assert codec.whole(FRAME) is not None
+    assert codec.whole(summed(b"MNERIM 034 parafrente %b PC " % parameters)) is None
+
+
 def test_the_complaint_of_a_robot_is_told_apart_from_noise() -> None:
     complaint = Malformed(COMPLAINT, b"CHECKSUM NAO BATEU!", 19)
     assert ascii_codec().decode(b"CHECKSUM NAO BATEU!\r\n", 0.0) == [complaint]

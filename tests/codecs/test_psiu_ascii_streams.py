@@ -80,6 +80,32 @@ def test_one_byte_at_a_time_gives_the_same_events(data: bytes, strict: bool) -> 
     assert read(ascii_codec(strict), *(bytes((byte,)) for byte in data)) == read(ascii_codec(strict), data)
 
 
+@given(
+    data=st.one_of(good, busy, loose, unpadded, spoiled, stream),
+    end=st.sampled_from([b"", b"\r\n", b"\r\n\r\n", b"\n", b" "]),
+    strict=st.booleans(),
+)
+def test_what_is_told_at_a_glance_is_what_reading_tells(data: bytes, end: bytes, strict: bool) -> None:
+    codec = ascii_codec(strict)
+    read(codec, data)
+    frame = codec.whole(data + end)
+    assert not codec.pending
+    if frame is not None:
+        assert read(ascii_codec(strict), *(bytes((byte,)) for byte in data + end)) == [frame]
+
+
+@given(
+    source=word, destination=word, words=st.lists(word, min_size=1, max_size=20), end=st.sampled_from([b"", b"\r\n"])
+)
+def test_a_frame_heard_before_is_told_at_a_glance(source: str, destination: str, words: list[str], end: bytes) -> None:
+    frame = wire(source, destination, words)
+    codec = PsiuAscii(PsiuAscii.Options(), Directory())
+    assert codec.whole(frame + end) is None
+    (heard,) = read(codec, frame)
+    if len(frame + end) <= 999:
+        assert codec.whole(frame + end) == heard
+
+
 @given(before=st.lists(good, max_size=4), noise=st.integers(0, 1200), data=stream)
 def test_cuts_far_into_long_noise_give_the_same_events(before: list[bytes], noise: int, data: bytes) -> None:
     whole = b"".join(before) + b"x 999 y" * noise + data + b" 12345 " * 700 + data
