@@ -105,7 +105,6 @@ class Exchange:
         self._max_age_s: dict[str, float] = {}
         self._own_name = own_name
         self._wall_clock = wall_clock
-        self._route = router.route
 
     def add(self, link: Link) -> None:
         """Take in a link; its books start now."""
@@ -124,17 +123,16 @@ class Exchange:
         account = self.accounts[way.link]
         account.arrived += 1
         bus = self.bus
-        decision = self._route(frame, way, now)
-        hops = decision.hops
-        if decision.action == "forward" and len(hops) == 1:
-            link, peer = hops[0]
-            verdict = self.links[link].offer(frame, peer, way, now, patience_s)
+        decision = self.router.route(frame, way, now)
+        only = decision.only
+        if only is not None:
+            verdict = self.links[only.link].offer(frame, only.peer, way, now, patience_s)
             if bus.listened:
-                self._publish(frame, hops, way)
+                self._publish(frame, decision.hops, way)
         else:
             # Before it is carried out: listeners hear a question before our answer to it.
             if bus.listened and decision is not DOUBLE and decision is not IMPOSSIBLE_SOURCE:
-                self._publish(frame, hops, way)
+                self._publish(frame, decision.hops, way)
             verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
             account.fates[verdict] += 1

@@ -7,11 +7,12 @@ which changes nothing and which `why` asks too.
 """
 
 from collections.abc import Callable, Collection, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
-from psiu_broker.frame import EVERYONE, NOBODY, Address, Frame, Way
+from psiu_broker.frame import EVERYONE, MESH, NOBODY, Address, Frame, Way
 from psiu_broker.routing.duplicates import Duplicates
+from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.table import Binding, Route, Table
 from psiu_broker.routing.verdicts import DUPLICATE, LINK_DOWN, NO_ROUTE, REFUSED, SAME_WAY, Verdict
 
@@ -33,11 +34,21 @@ class Decision:
     action: Action
     hops: tuple[Way, ...] = ()
     verdict: Verdict | None = None
+    only: Way | None = field(init=False, repr=False, compare=False)
+    """The hop of a forward that has just one, as nearly every frame's has."""
+
+    def __post_init__(self) -> None:
+        single = self.action == "forward" and len(self.hops) == 1
+        object.__setattr__(self, "only", self.hops[0] if single else None)
 
 
 DOUBLE: Final = Decision("drop", verdict=DUPLICATE)
 IMPOSSIBLE_SOURCE: Final = Decision("drop", verdict=REFUSED)
 _ANSWER: Final = Decision("answer")
+
+
+ANY: Final = ""
+"""The protocol of a port that carries every one."""
 
 
 class Port(NamedTuple):
@@ -60,6 +71,7 @@ class Router:
         identity: a frame's bytes in one form for all links, so that a double is known by them.
         heard: called when a robot is heard for the first time or from a new way.
         withdrawn: called when the route to a robot is given up.
+        ownership: who owns the robots that other brokers hear too; None where there are no others.
     """
 
     def __init__(
@@ -70,6 +82,7 @@ class Router:
         heard: Callable[[Route], None] = lambda _: None,
         withdrawn: Callable[[Route], None] = lambda _: None,
         duplicates: Duplicates | None = None,
+        ownership: Ownership | None = None,
     ) -> None:
         self.table = Table(bindings, withdrawn)
         self._routes = self.table.routes
@@ -77,22 +90,25 @@ class Router:
             route = Route((address,), SELF, protocol, pinned=True)
             route.decision = _ANSWER
             self._routes[address] = route
-        self._ports: dict[str, Port] = {}
+        self.ports: dict[str, Port] = {}
+        """The links that are up, and `MESH`."""
+        self._ownership = ownership
         self._identity = identity
         self._heard = heard
-        self._is_double = (duplicates or Duplicates()).is_double
+        self._duplicates = duplicates or Duplicates()
 
     def route(self, frame: Frame, arrived: Way, now: float) -> Decision:
         """Decide for a frame that arrived, and learn from it."""
-        if self._is_double(self._identity(frame), arrived, now):
-            return DOUBLE
-        source = self._routes.get(frame.source)
+        if self._duplicates.is_double(self._identity(frame), arrived, now):
+            return self._note_double(frame, arrived, now)
+        routes = self._routes
+        source = routes.get(frame.source)
         if source is not None and source.way is arrived:
             source.heard_at = now
             source.frames += 1
         elif not self._learn(frame, source, arrived, now):
             return IMPOSSIBLE_SOURCE
-        target = self._routes.get(frame.destination)
+        target = routes.get(frame.destination)
         if target is not None and target.protocol == frame.protocol and target.way != arrived:
             ready: Decision | None = target.decision
             if ready is not None:
@@ -110,8 +126,10 @@ class Router:
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
-        if target.way.link not in self._ports:
+        if target.way.link not in self.ports:
             return Decision("drop", verdict=LINK_DOWN)
+        if target.way.link == MESH:
+            return self._decide_by_mesh(target, arrived)
         if target.protocol != protocol:
             translatable = (protocol, target.protocol) == ("psiu-ascii", "psiu-hexa")
             return Decision("translate") if translatable else Decision("drop", verdict=REFUSED)
@@ -121,14 +139,14 @@ class Router:
         return Decision("drop", verdict=SAME_WAY if target.way.link == arrived.link else LINK_DOWN)
 
     def link_up(self, port: Port) -> None:
-        self._ports[port.link] = port
+        self.ports[port.link] = port
         for route in self.table:
             if route.way.link == port.link:
                 self._refresh(route)
 
     def link_down(self, link: str, now: float) -> None:
         """Withdraw what was learned on `link`."""
-        self._ports.pop(link, None)
+        self.ports.pop(link, None)
         for route in self.table:
             if route.way.link == link:
                 route.decision = None
@@ -145,8 +163,37 @@ class Router:
         return self._routes.get(address)
 
     def robots(self) -> list[Route]:
-        """Every robot that is known, the broker itself left out."""
-        return [route for route in self.table if route.way != SELF]
+        """Every robot on a link of this broker."""
+        return [route for route in self.table if route.way.link not in (SELF.link, MESH)]
+
+    def is_elsewhere(self, robot: Address) -> bool:
+        """Whether another broker has the robot."""
+        route = self._routes.get(robot)
+        return route is not None and route.way.link == MESH
+
+    def announced(self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float) -> None:
+        """Another broker, which `way` leads to, has the robot; what the configuration says of it here goes before."""
+        before = self._routes.get(addresses[0])
+        way_before = None if before is None else before.way
+        route = self.table.place(addresses, way, protocol, now)
+        if route is not None:
+            self._refresh(route)
+            if route is not before or way_before != way:
+                self._heard(route)
+
+    def unannounced(self, robot: Address, now: float) -> None:
+        """No other broker has the robot any more."""
+        route = self._routes.get(robot)
+        if route is not None and route.way.link == MESH:
+            self.table.withdraw(route, now)
+
+    def take(self, robot: Address, way: Way, protocol: str, now: float) -> None:
+        """The robot, of which another broker was the owner, is on a link of ours, where it was overheard."""
+        if way.link in self.ports:
+            route = self.table.learn(robot, way, protocol, now)
+            if route is not None:
+                self._refresh(route)
+                self._heard(route)
 
     def _learn(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> bool:
         """Take note of the sender; False if it cannot be who it says."""
@@ -154,6 +201,10 @@ class Router:
             return True
         if frame.source == EVERYONE or (source is not None and source.way == SELF):
             return False
+        if arrived.link == MESH:
+            return True  # other brokers announce their robots; what these say teaches nothing
+        if source is not None and source.way.link == MESH and not self._takes(source, frame, arrived, now):
+            return True
         news = source is None or source.way != arrived or source.heard_at is None
         route = self.table.learn(frame.source, arrived, frame.protocol, now)
         if route is not None:
@@ -162,22 +213,47 @@ class Router:
                 self._heard(route)
         return True
 
+    def _takes(self, source: Route, frame: Frame, arrived: Way, now: float) -> bool:
+        """Whether a robot of another broker, heard here, is ours from now on."""
+        return self._ownership is None or self._ownership.takes(source, frame, arrived, now)
+
+    def _note_double(self, frame: Frame, arrived: Way, now: float) -> Decision:
+        """A double goes nowhere, and yet its robot was heard on the link that brought it."""
+        source = self._routes.get(frame.source)
+        if source is not None and arrived.link not in (MESH, SELF.link):
+            if source.way == arrived:
+                source.heard_at = now
+            elif source.way.link == MESH and self._ownership is not None:
+                self._ownership.overhear(source, frame, arrived, now)
+        return DOUBLE
+
+    def _decide_by_mesh(self, target: Route, arrived: Way) -> Decision:
+        """For a robot of another broker: to that broker, never from one to the next."""
+        if arrived.link == MESH:
+            return Decision("drop", verdict=SAME_WAY)
+        if self._ownership is not None and self._ownership.heard_on(target.robot) == arrived.link:
+            return Decision("drop", verdict=SAME_WAY)  # it is on this very radio, and has heard the frame
+        port = self.ports.get(MESH)
+        if port is None or target.way not in port.ways():
+            return Decision("drop", verdict=LINK_DOWN)
+        return Decision("forward", (target.way,))
+
     def _refresh(self, route: Route) -> None:
         """Have the decision ready for the frames to come, if the way is one that needs no thought."""
-        port = self._ports.get(route.way.link)
-        known = port is not None and route.way in port.ways()
+        port = self.ports.get(route.way.link)
+        known = port is not None and route.way.link != MESH and route.way in port.ways()
         route.decision = Decision("forward", (route.way,)) if known else None
 
     def _ways_to(self, target: Route) -> Collection[Way]:
         """The robot's own way, if it is there; every way of its link while nobody knows which is the robot's."""
-        ways = self._ports[target.way.link].ways()
+        ways = self.ports[target.way.link].ways()
         return ways if target.way.peer is None else tuple(way for way in ways if way == target.way)
 
     def _everyone(self, protocol: str, arrived: Way) -> tuple[Way, ...]:
         return tuple(
             way
-            for port in self._ports.values()
-            if port.protocol == protocol and port.wildcard
+            for port in self.ports.values()
+            if port.protocol in (protocol, ANY) and port.wildcard and not port.link == MESH == arrived.link
             for way in port.ways()
             if way != arrived
         )
