@@ -1,0 +1,65 @@
+"""Five brokers in namespaces of their own, and what can befall them: `make mesh-proof EVENTS=100` for the figures."""
+
+import os
+import random
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pytest
+from system import events, network
+from system.healing import Healed, Watch, figures
+from system.lab import Lab, Mode
+from system.network import Network
+
+NODES: Final = 5
+EVENTS: Final = int(os.environ.get("PSIU_MESH_EVENTS", "8"))
+SEED: Final = int(os.environ.get("PSIU_MESH_SEED", "1"))
+"""The same seed draws the same events; what the machine makes of them differs."""
+
+pytestmark = pytest.mark.timeout(120 + 40 * EVENTS)
+
+
+class Topology(NamedTuple):
+    name: str
+    mode: Mode
+    cables: Sequence[tuple[int, int]]
+
+
+RING: Final = Topology("ring with a chord, router", "router", [(0, 1), (1, 2), (2, 3), (3, 4), (4, 0), (1, 4)])
+LINE: Final = Topology("line, router", "router", [(0, 1), (1, 2), (2, 3), (3, 4)])
+FULL: Final = Topology("fully connected, peer", "peer", [(a, b) for a in range(NODES) for b in range(a + 1, NODES)])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _networks_can_be_made() -> None:
+    obstacle = network.obstacle()
+    if obstacle is not None:
+        pytest.skip(f"NO PROOF THAT THE MESH HEALS: {obstacle}")
+
+
+@pytest.mark.parametrize("topology", [RING, LINE, FULL], ids=["ring", "line", "full"])
+async def test_after_whatever_befalls_it_the_mesh_heals_within_five_seconds(topology: Topology, tmp_path: Path) -> None:
+    chance = random.Random(f"{SEED}/{topology.name}")
+    healed: list[Healed] = []
+    with Network(NODES, topology.cables) as cables:
+        async with Lab(cables, topology.mode, tmp_path) as lab:
+            watch = Watch(lab)
+            try:
+                faults = [f"at the start: {fault}" for fault in await watch.start()]
+                for number, draw in enumerate(events.drawn(EVENTS, chance), 1):
+                    if faults and not healed:
+                        break
+                    healed.append(one := await watch.go_through(draw(lab, chance)))
+                    faults += [f"event {number}, {one.text}: {fault}" for fault in one.faults]
+                    took = "never healed" if one.healed_s is None else f"healed in {one.healed_s:.2f} s"
+                    print(
+                        f"{topology.name} {number}: {one.text}; {took}; {one.sent.lost} lost", *one.faults, sep="\n  "
+                    )
+                    if one.healed_s is None:
+                        break
+            finally:
+                await watch.stop()
+    print(figures(topology.name, healed))
+    report = "\n".join(faults)
+    assert not faults, f"{topology.name}, PSIU_MESH_SEED={SEED}, logs in {tmp_path}:\n{report}"
