@@ -119,7 +119,8 @@ class CallerProcess:
 
     async def ask(self, broker: str, what: str) -> dict[str, Any] | None:
         """What a broker answers to ``psiu/@broker/{broker}/{what}``, if it does."""
-        return (await self._request(ask=[broker, what])).get("answer")
+        answer: dict[str, Any] | None = (await self._request(ask=[broker, what])).get("answer")
+        return answer
 
     async def _request(self, **what: object) -> dict[str, Any]:
         number = next(self._numbers)

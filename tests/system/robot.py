@@ -4,6 +4,7 @@ import asyncio
 import socket
 import time
 from collections.abc import Callable
+from typing import cast
 
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.codecs.codec import Directory
@@ -45,8 +46,8 @@ class CountingRobot(asyncio.DatagramProtocol):
 
     # asyncio.DatagramProtocol
 
-    def connection_made(self, transport: asyncio.DatagramTransport) -> None:
-        self._transport = transport
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.DatagramTransport, transport)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
         now = time.monotonic()
@@ -54,7 +55,7 @@ class CountingRobot(asyncio.DatagramProtocol):
             if isinstance(event, Frame):
                 self._heard(event, now)
 
-    def error_received(self, exc: OSError) -> None:
+    def error_received(self, exc: Exception) -> None:
         """Its broker is down: what was sent is lost, as on any radio."""
 
     def _heard(self, frame: Frame, now: float) -> None:
