@@ -17,19 +17,21 @@ from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config import Configuration, LinkConfiguration
+from psiu_broker.config import Configuration, LinkConfiguration, TrunkConfiguration
 from psiu_broker.errors import BusError
 from psiu_broker.exchange import Exchange, NoBus
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Why
 from psiu_broker.messages import Link as LinkMessage
+from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.profiles import Node, describe
 from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
 from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.router import SELF, Router
+from psiu_broker.trunk import Endpoints, Trunks
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +68,8 @@ class Broker:
         )
         self.exchange = Exchange(self._own_name, router)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
-        self.report = Report(configuration.broker.name, self.exchange, self.resident.commands)
+        self._trunks = Trunks(configuration.broker.name, configuration.trunks.values())
+        self.report = Report(configuration.broker.name, self.exchange, self.resident.commands, self._trunks)
         for link in configuration.links.values():
             self.exchange.add(self._link(link))
         for robot in router.robots():
@@ -85,10 +88,15 @@ class Broker:
         Raises:
             BusError: the bus cannot open: an endpoint in `zenoh.listen` is taken or not ours.
         """
-        await self._open_bus()
+        try:
+            await self._open_bus()
+        except BaseException:
+            self._trunks.close()
+            raise
         create = asyncio.get_running_loop().create_task
         self._tasks = [create(self._tick(), name="tick"), create(self._keep_bus(), name="bus")]
-        self._link_tasks = [create(link.run(), name=f"link {link.name}") for link in self.exchange.links.values()]
+        kept = (*self.exchange.links.values(), *self._trunks)
+        self._link_tasks = [create(each.run(), name=f"{each.kind} {each.name}") for each in kept]
 
     async def stop(self) -> None:
         """Refuse new calls, let what waits go out, close the links, then the bus."""
@@ -106,6 +114,7 @@ class Broker:
         if self._bus is not None:
             self.exchange.bus = NoBus()
             await self._bus.session.close()
+        self._trunks.close()
 
     async def healthy(self) -> bool:
         """Whether everything makes progress: the loop's ticks, every link's life, and the bus, asked through Zenoh."""
@@ -134,6 +143,9 @@ class Broker:
     def links(self) -> Sequence[LinkMessage]:
         return self.report.links()
 
+    def trunks(self) -> Sequence[TrunkMessage]:
+        return self.report.trunks()
+
     def routes(self) -> Sequence[Route]:
         return self.report.routes()
 
@@ -150,6 +162,7 @@ class Broker:
             "broker": configuration.broker.model_dump(mode="json"),
             "zenoh": configuration.zenoh.model_dump(mode="json"),
             "links": {name: _link_table(link) for name, link in configuration.links.items()},
+            "trunks": {name: _trunk_table(trunk) for name, trunk in configuration.trunks.items()},
             "robots": {
                 robot.name: {
                     "link": robot.link,
@@ -230,7 +243,7 @@ class Broker:
     # Inside: the bus.
 
     async def _open_bus(self) -> None:
-        self._bus = await _Bus.open(self, self._bus_lost.set)
+        self._bus = await _Bus.open(self, self._trunks.meet(), self._bus_lost.set)
         self.exchange.bus = self._bus.publisher
         self._note(self.exchange.router.robots())
 
@@ -322,12 +335,12 @@ class _Bus:
         self.round_trip = round_trip
 
     @classmethod
-    async def open(cls, broker: Broker, lost: Callable[[], None]) -> "_Bus":
+    async def open(cls, broker: Broker, trunks: Endpoints, lost: Callable[[], None]) -> "_Bus":
         """Raises BusError."""
         zenoh = broker.configuration.zenoh
         name = broker.configuration.broker.name
         keys = Keys(zenoh.prefix)
-        session = await Session.open(zenoh.listen, lost=lambda _: lost())
+        session = await Session.open([*zenoh.listen, *trunks.listen], connect=trunks.connect, lost=lambda _: lost())
         try:
             return cls(
                 session,
@@ -361,12 +374,15 @@ def _describer(configuration: Configuration) -> Callable[[Frame], Mapping[str, A
     return lambda frame: describe(frame, lambda address: named.get(address, nothing))
 
 
+def _trunk_table(trunk: TrunkConfiguration | LinkConfiguration) -> dict[str, Any]:
+    secret = {name for name, field in type(trunk.adapter).model_fields.items() if not field.repr}
+    return {"adapter": trunk.adapter_name, **trunk.adapter.model_dump(mode="json", exclude=secret)}
+
+
 def _link_table(link: LinkConfiguration) -> dict[str, Any]:
-    secret = {name for name, field in type(link.adapter).model_fields.items() if not field.repr}
     return {
-        "adapter": link.adapter_name,
+        **_trunk_table(link),
         "protocol": link.protocol,
-        **link.adapter.model_dump(mode="json", exclude=secret),
         **link.codec.model_dump(mode="json"),
         **link.options.model_dump(mode="json"),
     }

@@ -137,6 +137,22 @@ class Link(Message):
     details: dict[str, Value] = {}
 
 
+class Trunk(Message):
+    """One trunk: ``psiu/@broker/{broker}/trunks``."""
+
+    name: str
+    adapter: str
+    state: Literal["waiting", "opening", "open", "closed"]
+    reason: str | None = Field(default=None, description="what it waits for, in words")
+    since: Moment
+    far: str | None = Field(
+        default=None, description="the broker at its far end, or those that called it, with spaces between"
+    )
+    bytes_in: int = 0
+    bytes_out: int = 0
+    overruns: int = Field(default=0, description="Zenoh connections given up because this broker did not read")
+
+
 class Route(Message):
     """Where frames for a robot go: ``psiu/@broker/{broker}/routes``."""
 
@@ -296,6 +312,7 @@ PUBLISHED: Final[tuple[type[Message], ...]] = (
     Refusal,
     RawFrame,
     Link,
+    Trunk,
     Route,
     Ledger,
     Status,

@@ -1,7 +1,7 @@
 """What the broker says of itself, as messages: cards, links, routes, the ledger, and why."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Final
 
@@ -10,8 +10,10 @@ from psiu_broker.frame import EVERYONE, Address, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import Account, Card, Command, Ledger, Route, Why
 from psiu_broker.messages import Link as LinkMessage
+from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.routing import table, verdicts
 from psiu_broker.routing.router import SELF, Decision
+from psiu_broker.trunk import Trunk
 
 
 class Report:
@@ -22,12 +24,14 @@ class Report:
         broker: str,
         exchange: Exchange,
         commands: Callable[[table.Route], Sequence[Command]],
+        trunks: Iterable[Trunk] = (),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._broker = broker
         self._exchange = exchange
         self._router = exchange.router
         self._commands = commands
+        self._trunks = trunks
         self._clock = clock
 
     def moment(self, at: float) -> datetime:
@@ -75,6 +79,22 @@ class Report:
             last_heard=None if link.last_heard is None else self.moment(link.last_heard),
             details=dict(link.details()),
         )
+
+    def trunks(self) -> list[TrunkMessage]:
+        return [
+            TrunkMessage(
+                name=trunk.name,
+                adapter=trunk.configuration.adapter_name,
+                state=trunk.state,
+                reason=trunk.reason,
+                since=self.moment(trunk.since),
+                far=" ".join(trunk.far) or None,
+                bytes_in=trunk.bytes_in,
+                bytes_out=trunk.bytes_out,
+                overruns=trunk.overruns,
+            )
+            for trunk in self._trunks
+        ]
 
     def routes(self) -> list[Route]:
         now = self._clock()

@@ -12,7 +12,7 @@ from psiu_broker.bus.replies import Replies, Values
 from psiu_broker.bus.session import JSON, Session, json_of
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Card, Health, Ledger, Link, Route, Status, Why
+from psiu_broker.messages import Card, Health, Ledger, Link, Route, Status, Trunk, Why
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +30,7 @@ class Source(Protocol):
 
     def status(self) -> Status: ...
     def links(self) -> Sequence[Link]: ...
+    def trunks(self) -> Sequence[Trunk]: ...
     def routes(self) -> Sequence[Route]: ...
     def ledger(self) -> Ledger: ...
     def health(self) -> Health: ...
@@ -56,6 +57,7 @@ class Queries:
         self._tables: Final[Mapping[str, tuple[zenoh.Encoding, Callable[[], object]]]] = {
             keys.broker(broker, "status"): (json_of("Status"), source.status),
             keys.broker(broker, "links"): (json_of("Link[]"), source.links),
+            keys.broker(broker, "trunks"): (json_of("Trunk[]"), source.trunks),
             keys.broker(broker, "routes"): (json_of("Route[]"), source.routes),
             keys.broker(broker, "ledger"): (json_of("Ledger"), source.ledger),
             keys.broker(broker, "health"): (json_of("Health"), source.health),

@@ -12,7 +12,7 @@ from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.session import Session
 from psiu_broker.frame import Address
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Refusal, Route, Status, Why
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Refusal, Route, Status, Trunk, Why
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
@@ -40,6 +40,9 @@ class Broker:
 
     def links(self) -> Sequence[Link]:
         return [Link(name="radio", adapter="serial", protocol="psiu-ascii", state="open", since=NOW)]
+
+    def trunks(self) -> Sequence[Trunk]:
+        return [Trunk(name="hill", adapter="rfcomm", state="open", since=NOW, far="hill")]
 
     def routes(self) -> Sequence[Route]:
         return []
@@ -111,7 +114,9 @@ async def test_lists_are_arrays_and_times_are_rfc_3339(queries: Queries, program
 
 
 async def test_wildcards_get_each_answer_on_its_own_key(queries: Queries, program: zenoh.Session) -> None:
-    every = {f"psiu/@broker/base/{what}" for what in ("status", "links", "routes", "ledger", "health", "config")}
+    every = {
+        f"psiu/@broker/base/{what}" for what in ("status", "links", "trunks", "routes", "ledger", "health", "config")
+    }
     assert set(await ask(program, "psiu/@broker/base/*")) == every
     assert set(await ask(program, "psiu/@broker/**")) == every
     assert set(await ask(program, "psiu/@broker/*/status")) == {"psiu/@broker/base/status"}
