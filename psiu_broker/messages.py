@@ -229,7 +229,11 @@ class Why(Message):
     link: str | None = Field(default=None, description="what the frame leaves on; null: on none, or on several")
     age_s: float | None = Field(default=None, description="since b was last heard, as far as this broker knows")
     filter: str | None = Field(default=None, description="what could stop the frame here, or did")
-    cost_ms: float | None = Field(default=None, description="what waits for the link now and the frame, on the wire")
+    cost_ms: float | None = Field(
+        default=None,
+        description="what waits for the link now, and a frame of 40 bytes (PSIU HEXA: 6), on the wire;"
+        " 0 where the wire is no limit",
+    )
 
 
 class MeshBroker(Message):

@@ -1,17 +1,21 @@
 """What the broker says of itself, as messages: cards, links, routes, the ledger, and why."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, Literal
 
 from psiu_broker.exchange import Exchange
-from psiu_broker.frame import EVERYONE, Address, peer_text
+from psiu_broker.frame import EVERYONE, MESH, Address, Way, peer_text
 from psiu_broker.link import Link
-from psiu_broker.messages import Account, Card, Command, Ledger, Route, Why
+from psiu_broker.mesh.mesh import Mesh
+from psiu_broker.messages import Account, Card, Command, Conflict, Ledger, MeshBroker, MeshRobot, Route, Why
 from psiu_broker.messages import Link as LinkMessage
+from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.routing import table, verdicts
+from psiu_broker.routing.claims import BEST
 from psiu_broker.routing.router import SELF, Decision
 from psiu_broker.trunk import Trunk
 
@@ -96,12 +100,59 @@ class Report:
             for trunk in self._trunks
         ]
 
+    def mesh(self, mesh: Mesh, mode: Literal["peer", "router"], zenoh_id: str, linked: Collection[str]) -> MeshMessage:
+        """The other brokers as `mesh` knows them; `linked` are the Zenoh ids that a link of ours leads to."""
+        now = self._clock()
+        robots = [
+            MeshRobot(
+                robot=str(claim.robot),
+                address=None if claim.number is None else str(claim.number),
+                protocol=claim.protocol,
+                owner=owner,
+                link=claim.link,
+                quality=claim.quality / BEST,
+                age_s=claim.age_s,
+                term=claim.term,
+            )
+            for owner, claim in mesh.claims
+        ]
+        owned = Counter(robot.owner for robot in robots)
+        brokers = [
+            MeshBroker(
+                name=each.name,
+                zenoh_id=each.zenoh_id,
+                since=self.moment(each.since),
+                rtt_ms=None if each.round_trip_s is None else round(each.round_trip_s * 1000, 3),
+                silent_s=None if each.beat_at is None else round(now - each.beat_at, 3),
+                frames_in=each.frames_in,
+                frames_out=each.frames_out,
+                lost=each.lost,
+                robots=owned[each.name],
+                linked=each.zenoh_id in linked,
+            )
+            for each in mesh.neighbours
+        ]
+        return MeshMessage(
+            broker=self._broker,
+            mode=mode,
+            zenoh_id=zenoh_id,
+            brokers=sorted(brokers, key=lambda broker: broker.name),
+            robots=sorted(robots, key=lambda robot: robot.robot),
+            conflicts=[self._conflict(*each) for each in mesh.conflicts(now)],
+            redeclared=mesh.declared_anew,
+        )
+
+    def _conflict(self, name: str, brokers: Iterable[str], since: float, detail: str) -> Conflict:
+        return Conflict(robot=name, brokers=sorted(brokers), since=self.moment(since), detail=detail)
+
     def routes(self) -> list[Route]:
         now = self._clock()
-        return [self._route(route, now) for route in self._router.robots()]
+        return [self._route(route, now) for route in self._router.table if route.way != SELF]
 
     def _route(self, route: table.Route, now: float) -> Route:
         age_s = None if route.heard_at is None else now - route.heard_at
+        if route.way.link == MESH:
+            return Route(robot=str(route.robot), link=MESH, peer=peer_text(route.way.peer), origin="mesh")
         limit_s = self._exchange.links[route.way.link].configuration.options.route_age_s
         return Route(
             robot=str(route.robot),
@@ -134,8 +185,27 @@ class Report:
             steps.append(self._where(destination, target))
         steps.append(self._outcome(decision, destination, protocol, target))
         verdict = decision.verdict or _ENDS[decision.action]
-        delivered = verdict in verdicts.KEPT
-        return Why(a=str(source), b=str(destination), delivered=delivered, verdict=verdict, steps=steps)
+        ways = decision.hops
+        if not ways and target is not None and decision.action in ("translate", "drop"):
+            ways = (target.way,)
+        brokers = {str(way.peer) for way in ways if way.link == MESH} if decision.action in _MOVES else set()
+        links = {way.link for way in ways if way.link in self._exchange.links}
+        link = self._exchange.links[links.pop()] if len(links) == 1 else None
+        heard_at = None if target is None else target.heard_at
+        return Why(
+            a=str(source),
+            b=str(destination),
+            delivered=verdict in verdicts.KEPT,
+            verdict=verdict,
+            steps=steps,
+            broker=self._broker,
+            entry=None if origin is None else origin.way.link,
+            via=None if not brokers else brokers.pop() if len(brokers) == 1 else "*",
+            link=None if link is None else link.name,
+            age_s=None if heard_at is None else round(self._clock() - heard_at, 3),
+            filter=self._filter(decision, protocol, arrived, target, link),
+            cost_ms=None if link is None or decision.action == "drop" else _cost_ms(link),
+        )
 
     def _where(self, address: Address, route: table.Route | None) -> str:
         now = self._clock()
@@ -143,9 +213,13 @@ class Report:
             departed = self._router.table.departed(address)
             if departed is None:
                 return f"{address} has not been heard on any link"
-            return f"{address} was on {departed.link} until {now - departed.at:.1f} s ago; its route was withdrawn"
+            place = "with another broker" if departed.link == MESH else f"on {departed.link}"
+            return f"{address} was {place} until {now - departed.at:.1f} s ago; its route was withdrawn"
         if route.way == SELF:
             return f"{address} is this broker"
+        if route.way.link == MESH:
+            broker = peer_text(route.way.peer)
+            return f"{address} is a broker" if broker == str(address) else f"{address} is with broker {broker}"
         link = self._exchange.links[route.way.link]
         state = "open" if link.state == "open" else f"{link.state} ({link.reason})"
         heard = "not heard yet" if route.heard_at is None else f"last heard {now - route.heard_at:.1f} s ago"
@@ -168,6 +242,47 @@ class Report:
             case _:
                 return f"dropped ({decision.verdict}): {_REASONS.get(str(decision.verdict), '')}"
 
+    def _filter(
+        self, decision: Decision, protocol: str, arrived: Way, target: table.Route | None, link: Link | None
+    ) -> str | None:
+        """What did or could stop a frame, or keeps it from some links."""
+        match decision.action:
+            case "drop":
+                return self._stopped(decision, protocol, arrived, target, link)
+            case "flood" | "ask":
+                kept = [
+                    each.name
+                    for each in self._exchange.links.values()
+                    if each.codec.protocol == protocol and not each.configuration.options.wildcard
+                ]
+                return f"wildcard = false: not on {', '.join(kept)}" if kept else None
+            case "translate":
+                return f"translation: what {target and target.protocol} cannot say is answered with falha"
+            case "forward" if link is not None:
+                limit_s = link.configuration.options.max_age_s
+                return f"max_age_s = {limit_s:g}: dropped if it has to wait longer for {link.name}"
+            case _:
+                return None
+
+    def _stopped(
+        self, decision: Decision, protocol: str, arrived: Way, target: table.Route | None, link: Link | None
+    ) -> str:
+        match decision.verdict:
+            case "same_way" if target is not None and target.way == SELF:
+                return "a broker sends itself nothing"
+            case "same_way" if arrived.link == MESH:
+                return "split horizon: what comes from a broker is not handed to a broker"
+            case "same_way" if target is not None and target.way.link == MESH:
+                return f"split horizon: {target.robot} is on {arrived} too, and has heard it there"
+            case "same_way":
+                return f"split horizon: what comes on {arrived} does not leave on it"
+            case "refused" if target is not None:
+                return f"no translation from {protocol} to {target.protocol}"
+            case "link_down" if link is not None:
+                return f"{link.name} is {link.state}"
+            case _:
+                return str(_REASONS.get(str(decision.verdict), decision.verdict))
+
 
 _ENDS: Final[Mapping[str, verdicts.Verdict]] = {
     "forward": verdicts.DELIVERED,
@@ -178,12 +293,26 @@ _ENDS: Final[Mapping[str, verdicts.Verdict]] = {
 }
 """How a frame ends, as far as can be told beforehand."""
 
+_MOVES: Final = frozenset({"forward", "flood", "translate"})
+"""The actions that hand a frame, or its meaning, on."""
+
+_BITS_A_BYTE: Final = 10
+_USUAL_BYTES: Final[Mapping[str, int]] = {"psiu-ascii": 40, "psiu-hexa": 6}
+"""How long a frame is for which the cost is told: ``base 040 parafrente sucesso MNERIM 03012``."""
+
 _REASONS = {
     "no_route": "nobody knows it, and there is no open link to ask on",
     "same_way": "both are on one line, where it was heard already",
     "link_down": "its link is down",
     "refused": "it speaks another protocol, and there is no translation",
 }
+
+
+def _cost_ms(link: Link) -> float:
+    """How long a frame offered now would take until its last bit is on the wire, the frame under way left out."""
+    waiting = sum(len(parcel.wire) for parcel in link.outbox) + _USUAL_BYTES.get(link.codec.protocol, 0)
+    bits_per_second = link.adapter.bits_per_second
+    return 0.0 if bits_per_second is None else round(waiting * _BITS_A_BYTE * 1000 / bits_per_second, 3)
 
 
 def _account(name: str, account: verdicts.Account, waiting: int) -> Account:

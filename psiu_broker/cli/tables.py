@@ -1,4 +1,4 @@
-"""What the brokers know: `psiu robots`, `links`, `routes`, `ledger`, `status` and `why`."""
+"""What the brokers know: `psiu robots`, `links`, `routes`, `ledger` and `status`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
@@ -8,7 +8,7 @@ import click
 from psiu_broker.cli.commands import Failure, examples
 from psiu_broker.cli.connection import Connection, connects
 from psiu_broker.cli.output import Cell, ago, on_terminal, print_json, print_rows, print_table, printable, styled
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status, Why
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status
 from psiu_broker.profiles.psiu import QUESTIONS
 
 Told = Sequence[tuple[str, Any]]
@@ -108,29 +108,6 @@ def status(connection: Connection) -> None:
         print_json([{**each.model_dump(mode="json"), **health.model_dump(mode="json")} for each, health in found])
     else:
         show_status(found)
-
-
-@click.command(epilog=examples("psiu why BETA MNERIM", "psiu why base 0x12", "psiu why BETA '??' --json"))
-@click.argument("a")
-@click.argument("b")
-@connects
-def why(connection: Connection, a: str, b: str) -> None:
-    """Tell what would become of a frame from robot A to robot B now, and why.
-
-    A robot is a name, a PSIU HEXA address such as 0x12 or red.0x12, or ?? for everyone. With --json: a list with the
-    decision of each broker (psiu schema Why).
-    """
-    told = _ask(connection, "why", a, b)
-    if connection.as_json:
-        print_json([{"broker": broker, **each} for broker, each in told])
-        return
-    for _, each in told:
-        decision = Why.model_validate(each)
-        verdict = "would arrive" if decision.delivered else f"would not arrive: {decision.verdict}"
-        heading = f"{decision.a} → {decision.b} {verdict}"
-        click.echo(styled(printable(heading), fg="green" if decision.delivered else "red", bold=True))
-        for step in decision.steps:
-            click.echo(f"  {printable(step)}")
 
 
 def show_robots(cards: Sequence[Card], *, drawn: bool) -> None:

@@ -13,7 +13,20 @@ from psiu_broker.cli.tool import psiu
 
 Run = Callable[..., Result]
 
-ON_THE_BUS = ("discover", "robots", "call", "send", "monitor", "links", "routes", "why", "mesh", "ledger", "status")
+ON_THE_BUS = (
+    "discover",
+    "robots",
+    "call",
+    "send",
+    "monitor",
+    "links",
+    "routes",
+    "why",
+    "trace",
+    "mesh",
+    "ledger",
+    "status",
+)
 ALONE = ("decode", "encode", "sim", "schema")
 
 

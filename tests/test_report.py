@@ -1,0 +1,160 @@
+"""Why a frame would arrive, or not: an exchange with real links and routes; nothing is sent."""
+
+import pytest
+from memory_adapter import MemoryAdapter, MemoryTransport, codec_of, configuration
+
+from psiu_broker.codecs.identity import identity
+from psiu_broker.codecs.psiu_ascii import message
+from psiu_broker.errors import LinkLost
+from psiu_broker.exchange import Exchange, Resident
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
+from psiu_broker.link import Link
+from psiu_broker.messages import Why
+from psiu_broker.report import Report
+from psiu_broker.routing.router import ANY, SELF, Port, Router
+from psiu_broker.routing.table import Binding
+
+BASE, PC, MNERIM, FAR = (Address.named(name) for name in ("base", "PC", "MNERIM", "FAR"))
+ARM = Address.numbered(0x12)
+
+
+class Line(MemoryAdapter):
+    """A line of 9,600 bits a second."""
+
+    @property
+    def bits_per_second(self) -> int:
+        return 9600
+
+
+class Mute(Resident):
+    """Answers nobody."""
+
+    def answer(self, frame: Frame, way: Way, now: float) -> None: ...
+    def link_opened(self, link: Link, now: float) -> None: ...
+    def link_closed(self, link: Link, now: float) -> None: ...
+
+
+class World:
+    """base has PC on wifi, MNERIM on a slow radio, an arm of bytes, and the brokers north and gate; FAR is at north."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        bindings = (Binding(Address.named("BRACO"), ARM, Way("arm"), "psiu-hexa"),)
+        self.router = Router({BASE: "psiu-ascii"}, bindings, identity)
+        self.exchange = Exchange(BASE, self.router)
+        self.exchange.resident = Mute()
+        self.transports: dict[str, MemoryTransport] = {}
+        self.report = Report("base", self.exchange, lambda _: (), clock=lambda: self.now)
+        self._add("wifi", MemoryAdapter())
+        self._add("radio", Line(), wildcard=False)
+        self._add("arm", Line(), "psiu-hexa", topology="point-to-point", remote=0x12)
+        brokers = [Way(MESH, "north"), Way(MESH, "gate")]
+        self.router.link_up(Port(MESH, ANY, lambda: brokers))
+        self.router.announced((FAR,), brokers[0], "psiu-ascii", self.now)
+        self.router.announced((Address.named("north"),), brokers[0], "psiu-ascii", self.now)
+        for robot, link in ((PC, "wifi"), (MNERIM, "radio")):
+            self.router.route(message(robot, BASE, "qualseunome"), Way(link), self.now)
+        self.now += 3
+
+    def _add(self, name: str, adapter: MemoryAdapter, protocol: str = "psiu-ascii", **more: object) -> None:
+        wildcard = more.pop("wildcard", True)
+        made = configuration(name, protocol, adapter, more, wildcard=wildcard, max_age_s=2.0)
+        link = Link(made, lambda: codec_of(made), self.exchange, unaddressed=bool(more), clock=lambda: self.now)
+        self.exchange.add(link)
+        self.transports[name] = MemoryTransport()
+        link.connected(self.transports[name])
+
+    def why(self, a: Address, b: Address) -> Why:
+        why = self.report.why(a, b)
+        assert (why.a, why.b, why.broker) == (str(a), str(b), "base")
+        return why
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+def test_a_hop_over_a_link_has_its_age_its_limit_and_its_cost(world: World) -> None:
+    why = world.why(PC, MNERIM)
+    assert (why.delivered, why.entry, why.via, why.link, why.age_s) == (True, "wifi", None, "radio", 3.0)
+    assert why.filter == "max_age_s = 2: dropped if it has to wait longer for radio"
+    assert why.cost_ms == pytest.approx(40 * 10 / 9.6, abs=0.001)
+
+
+def test_what_waits_adds_to_the_cost(world: World) -> None:
+    link = world.exchange.links["radio"]
+    world.transports["radio"].full = True
+    before = world.why(PC, MNERIM).cost_ms
+    frame = message(PC, MNERIM, "parafrente", "100")
+    link.offer(frame, None, Way("wifi"), world.now)
+    assert before is not None
+    assert world.why(PC, MNERIM).cost_ms == pytest.approx(before + len(link.codec.encode(frame)) * 10 / 9.6, abs=0.01)
+
+
+def test_a_wire_that_is_no_limit_costs_nothing(world: World) -> None:
+    assert world.why(MNERIM, PC).cost_ms == 0
+
+
+def test_a_robot_of_another_broker_is_handed_to_it(world: World) -> None:
+    why = world.why(PC, FAR)
+    assert (why.delivered, why.entry, why.via, why.link, why.cost_ms) == (True, "wifi", "north", None, None)
+    assert "FAR is with broker north" in why.steps
+    assert "north is a broker" in world.why(PC, Address.named("north")).steps
+
+
+def test_what_comes_from_a_broker_goes_to_no_other(world: World) -> None:
+    here = world.why(FAR, MNERIM)
+    assert (here.delivered, here.entry, here.link) == (True, MESH, "radio")
+    on = world.why(FAR, Address.named("north"))
+    assert (on.delivered, on.verdict, on.via) == (False, "same_way", None)
+    assert on.filter == "split horizon: what comes from a broker is not handed to a broker"
+
+
+def test_everyone_is_on_several_ways_but_where_wildcard_is_false(world: World) -> None:
+    why = world.why(PC, EVERYONE)
+    assert (why.delivered, why.via, why.link) == (True, "*", None)
+    assert why.filter == "wildcard = false: not on radio"
+    from_afar = world.why(FAR, EVERYONE)
+    assert (from_afar.via, from_afar.link) == (None, "wifi")
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "verdict", "said"),
+    [
+        (MNERIM, MNERIM, "same_way", "split horizon: what comes on radio does not leave on it"),
+        (BASE, BASE, "same_way", "a broker sends itself nothing"),
+        (ARM, MNERIM, "refused", "no translation from psiu-hexa to psiu-ascii"),
+        (PC, Address.numbered(0x77), "no_route", "nobody knows it, and there is no open link to ask on"),
+    ],
+)
+def test_what_stops_a_frame_is_named(world: World, a: Address, b: Address, verdict: str, said: str) -> None:
+    why = world.why(a, b)
+    assert (why.delivered, why.verdict, why.filter, why.cost_ms, why.via) == (False, verdict, said, None, None)
+
+
+def test_a_link_that_is_down_stops_it(world: World) -> None:
+    world.exchange.links["arm"].lost(LinkLost("unplugged"))
+    why = world.why(PC, ARM)
+    assert (why.verdict, why.link, why.filter) == ("link_down", "arm", "arm is waiting")
+
+
+def test_what_the_broker_answers_leaves_on_no_link(world: World) -> None:
+    why = world.why(PC, BASE)
+    assert (why.delivered, why.verdict, why.link, why.filter) == (True, "answered", None, None)
+    assert world.why(BASE, PC).entry == SELF.link
+    assert world.why(Address.named("NOBODY"), PC).entry is None
+
+
+def test_translation_is_told_with_its_link(world: World) -> None:
+    why = world.why(PC, ARM)
+    assert (why.verdict, why.link, why.cost_ms) == ("answered", "arm", pytest.approx(6 * 10 / 9.6))
+    assert str(why.filter).startswith("translation: what psiu-hexa cannot say")
+
+
+def test_routes_tell_of_the_robots_of_other_brokers(world: World) -> None:
+    routes = {route.robot: route for route in world.report.routes()}
+    assert {name: route.origin for name, route in routes.items()} == {
+        "BRACO": "static", "FAR": "mesh", "north": "mesh", "PC": "learned", "MNERIM": "learned",
+    }  # fmt: skip
+    assert (routes["FAR"].link, routes["FAR"].peer, routes["FAR"].expires_in_s) == (MESH, "north", None)
