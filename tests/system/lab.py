@@ -124,7 +124,8 @@ class CallerProcess:
 
     async def _request(self, **what: object) -> dict[str, Any]:
         number = next(self._numbers)
-        future = self._waiting[number] = asyncio.get_running_loop().create_future()
+        future: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._waiting[number] = future
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"id": number, **what}).encode() + b"\n")
         return await future
