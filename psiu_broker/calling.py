@@ -217,19 +217,18 @@ class Calling:
         return Answer(values=values, elapsed_ms=elapsed_ms)
 
     async def _seek(self, robot: Address, timeout_s: float | None) -> Route:
-        """Ask for an unknown robot by its name, and wait a moment for it.
+        """Ask for an unknown robot, and wait a moment for it.
 
         Raises:
             CallError: unknown_robot, or link_down where it was on a link that went down.
         """
-        if not robot.is_numbered and robot != EVERYONE:
+        if robot != EVERYONE:
             search = self._searches.setdefault(robot, _Search())
             search.callers += 1
             try:
-                if search.callers == 1:
-                    self._exchange.ask_for(robot, self._clock())
-                async with asyncio.timeout(min(SOUGHT_S, timeout_s or SOUGHT_S)):
-                    await search.found.wait()
+                if search.callers > 1 or self._exchange.ask_for(robot, self._clock()):
+                    async with asyncio.timeout(min(SOUGHT_S, timeout_s or SOUGHT_S)):
+                        await search.found.wait()
             except TimeoutError:
                 pass
             finally:
@@ -262,7 +261,7 @@ class Calling:
                 for link in self._exchange.links.values():
                     wildcard = link.configuration.options.wildcard and link.codec.protocol == "psiu-ascii"
                     if link.state == "open" and wildcard:
-                        self._exchange.ask_names(link, now)
+                        self._exchange.ask_names(link, now, told=True)
                 await asyncio.sleep(LISTENING_S)
                 await asyncio.gather(*(self._inquire(route) for route in self._router.robots()))
         except TimeoutError:

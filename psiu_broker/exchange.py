@@ -7,12 +7,14 @@ from datetime import UTC, datetime
 from math import inf
 from typing import Final, Literal, Protocol, cast
 
-from psiu_broker.codecs import psiu_ascii
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
+from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
 from psiu_broker.profiles.rarely import Rarely
+from psiu_broker.routing.allowance import Allowance
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate
 from psiu_broker.routing.router import DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
@@ -29,6 +31,9 @@ from psiu_broker.routing.verdicts import (
 SEARCHES_AT_ONCE: Final = 3
 SEARCH_EVERY_S: Final = 10.0
 """In the long run, for one robot that others search: on slow links a search would else come round to us for ever."""
+
+BITS_A_BYTE: Final = 10
+_SEARCHES: Final = frozenset({"qualseunome", "ping"})
 
 
 class Bus(Protocol):
@@ -69,7 +74,7 @@ class Resident(Protocol):
         """Bytes that were no frame: perhaps a robot's complaint, perhaps one to make ourselves."""
 
     def asked_names(self, ways: Iterable[Way], now: float) -> None:
-        """The broker has just asked for names there: the next qualseunome from each robot is its answer."""
+        """The broker has just asked who is there: the next qualseunome or ping from each robot is its answer."""
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         """A frame of the broker's own that waited was dropped."""
@@ -96,6 +101,8 @@ class Exchange:
         self.bus: Bus = NoBus()
         self.links: dict[str, Link] = {}
         self.accounts: dict[str, Account] = {SELF.link: Account()}
+        self.allowances: dict[str, Allowance] = {}
+        """For what the broker asks on each link without having been told to."""
         self.router = router
         self.holding = holding or Holding()
         self._searches = Rarely()
@@ -110,8 +117,11 @@ class Exchange:
         """Take in a link; its books start now."""
         self.links[link.name] = link
         self.accounts[link.name] = Account()
+        self.allowances[link.name] = Allowance(link.adapter.bits_per_second)
         options = link.configuration.options
-        self._ports[link.name] = Port(link.name, link.configuration.protocol, link.ways, options.wildcard)
+        self._ports[link.name] = Port(
+            link.name, link.configuration.protocol, link.ways, options.wildcard, _domain(link.configuration.codec)
+        )
         self._route_age_s[link.name] = options.route_age_s
         self._max_age_s[link.name] = options.max_age_s
 
@@ -155,13 +165,20 @@ class Exchange:
         """
         return self.heard(frame, SELF, now, patience_s)
 
-    def ask_names(self, link: Link, now: float) -> None:
-        """Ask everyone on one link who they are."""
-        self._ask_names(EVERYONE, link.ways(), now)
+    def ask_names(self, link: Link, now: float, *, told: bool = False) -> None:
+        """Ask everyone on one link who they are; unless we were told to, only where our allowance has room."""
+        self._ask_on(EVERYONE, link.ways(), now, told=told)
 
-    def ask_for(self, robot: Address, now: float) -> None:
-        """Ask for a robot by its name on every link where it may hear its name."""
-        self._ask_names(robot, self.router.decide(robot, "psiu-ascii", SELF).hops, now)
+    def ask_for(self, robot: Address, now: float) -> bool:
+        """Ask for a robot on every link where it may hear its name or number; False if there is none."""
+        protocol = psiu_hexa.PROTOCOL if robot.is_numbered else psiu_ascii.PROTOCOL
+        hops = self.router.decide(robot, protocol, SELF).hops
+        self._ask_on(robot, hops, now)
+        return bool(hops)
+
+    def may_ask(self, robot: Address, link: str, now: float, times: int = 1) -> bool:
+        """Whether our allowance has room for asking `robot` on `link` without being told; if so, it is charged."""
+        return self._may_say(self._question(robot, link), link, now, times)
 
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None:
         final = fate.settle(verdict)
@@ -280,30 +297,57 @@ class Exchange:
         self.bus.publish(frame, way, self._wall_clock())
 
     def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
-        """Hold a frame for an unknown robot, and ask for the robot by its name."""
+        """Hold a frame for an unknown robot, and ask for the robot."""
         robot = frame.destination
         if way is SELF or not self.holding.add(frame, way, now):
             return NO_ROUTE
         if self.holding.is_due(robot, now) and self._may_search(frame, now):
             self.holding.asked(robot, now)
-            self._ask_names(robot, hops, now)
+            self._ask_on(robot, hops, now)
         return None
 
     def _may_search(self, frame: Frame, now: float) -> bool:
         """Whether `frame` may have us ask for its destination; it may be another broker's search for the same."""
-        return frame.subject != "qualseunome" or self._searches.may(
+        return frame.subject not in _SEARCHES or self._searches.may(
             frame.destination, now, SEARCH_EVERY_S, SEARCHES_AT_ONCE
         )
 
-    def _ask_names(self, robot: Address, hops: tuple[Way, ...], now: float) -> None:
-        if not hops:
-            return
-        frame = psiu_ascii.message(self._own_name, robot, "qualseunome")
-        self.resident.asked_names(hops, now)
+    def _ask_on(self, robot: Address, hops: Iterable[Way], now: float, *, told: bool = False) -> None:
+        questions: dict[Frame, list[Way]] = {}
+        for hop in hops:
+            frame = self._question(robot, hop.link)
+            if told or self._may_say(frame, hop.link, now):
+                questions.setdefault(frame, []).append(hop)
         account = self.accounts[SELF.link]
-        account.arrived += 1
-        if self.bus.listened:
-            self._publish(frame, hops, SELF)
-        verdict = self._spread(frame, hops, SELF, now)
-        if verdict is not None:
-            account.fates[verdict] += 1
+        for frame, asked in questions.items():
+            self.resident.asked_names(asked, now)
+            account.arrived += 1
+            if self.bus.listened:
+                self._publish(frame, tuple(asked), SELF)
+            verdict = self._spread(frame, tuple(asked), SELF, now)
+            if verdict is not None:
+                account.fates[verdict] += 1
+
+    def _question(self, robot: Address, link: str) -> Frame:
+        """What makes `robot` speak: a name is asked for, a number is pinged, which moves nobody."""
+        if robot.is_numbered:
+            codec = cast(PsiuHexa.Options, self.links[link].configuration.codec)
+            return psiu_hexa.packet(Address.numbered(codec.local, codec.domain), robot, b"")
+        return psiu_ascii.message(self._own_name, robot, "qualseunome")
+
+    def _may_say(self, frame: Frame, link: str, now: float, times: int = 1) -> bool:
+        allowance = self.allowances.get(link)
+        if allowance is None:  # the mesh
+            return True
+        try:
+            size = len(self.links[link].codec.encode(frame))
+        except EncodeError:
+            size = 0
+        return allowance.may(times * size * BITS_A_BYTE, now)
+
+
+def _domain(codec: object) -> str | None:
+    """Whose numbers a packet of a link can carry to a robot that is not known yet."""
+    if isinstance(codec, PsiuHexa.Options) and codec.topology != "point-to-point":
+        return codec.domain
+    return None

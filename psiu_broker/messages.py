@@ -133,6 +133,9 @@ class Link(Message):
     malformed: int = 0
     queued: int = 0
     reopened: int = 0
+    unasked: int = Field(
+        default=0, description="questions of the broker's own not asked here, to leave the line to others"
+    )
     last_heard: Moment | None = None
     details: dict[str, Value] = {}
 

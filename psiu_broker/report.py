@@ -80,6 +80,7 @@ class Report:
             malformed=link.malformed,
             queued=link.outbox.size,
             reopened=max(link.opened - 1, 0),
+            unasked=self._exchange.allowances[link.name].refused,
             last_heard=None if link.last_heard is None else self.moment(link.last_heard),
             details=dict(link.details()),
         )

@@ -102,13 +102,17 @@ class Resident:
         self._calling.undelivered(frame, verdict)
 
     def link_opened(self, link: Link, now: float) -> None:
-        """Greet: ask who is there, so that robots are known before anybody needs them."""
-        if not link.configuration.options.greet:
+        """Greet, as far as our allowance on the link goes: robots are to be known before anybody needs them."""
+        options = link.configuration.options
+        if not options.greet:
             return
-        if link.codec.protocol == "psiu-ascii" and link.configuration.options.wildcard:
+        if link.codec.protocol == "psiu-ascii" and options.wildcard:
             self._exchange.ask_names(link, now)
         for route in self._router.robots():
-            if route.way.link == link.name and route.protocol == "psiu-hexa" and len(self._tasks) < TASKS_KEPT:
+            if route.way.link != link.name or route.protocol != "psiu-hexa" or len(self._tasks) >= TASKS_KEPT:
+                continue
+            number = next(address for address in route.addresses if address.is_numbered)
+            if self._exchange.may_ask(number, link.name, now, 1 + options.retries):
                 self._start(self._greet(route))
 
     def link_closed(self, link: Link, now: float) -> None:
@@ -143,13 +147,14 @@ class Resident:
     # Inside.
 
     def _says_its_name(self, frame: Frame, way: Way, now: float) -> bool:
-        """Whether `frame` answers our qualseunome: the first one from its sender on the link where we just asked.
+        """Whether `frame` answers our qualseunome or ping: its sender's first on the link where we just asked.
 
         Any other is a question to us, and in the same words. A group is asked by one way, and each of its robots
         answers by another, its own.
         """
         asked = self._asked.get(way.link)
-        if frame.subject != NAME or frame.destination != self.name or asked is None:
+        ours = frame.subject == "ping" or (frame.subject == NAME and frame.destination == self.name)
+        if not ours or asked is None:
             return False
         if now - asked.at > NAME_WITHIN_S or frame.source in asked.answered:
             return False

@@ -193,6 +193,58 @@ def test_a_robot_that_does_not_answer_to_its_name_has_no_route(world: World) -> 
     world.balances()
 
 
+def test_a_packet_for_an_unknown_number_waits_while_the_number_is_pinged() -> None:
+    world = World()
+    for name, domain in (("field", ""), ("yard", ""), ("theirs", "red")):
+        world._add(name, MemoryAdapter(), "psiu-hexa", topology="ad-hoc", domain=domain)
+    world.connect("arm", "field", "yard", "theirs")
+    plain = codec_of(configuration(protocol="psiu-hexa"))
+    own, one, other = (Address.numbered(number) for number in (0, 1, 9))
+    command = plain.encode(psiu_hexa.packet(one, other, b"\x04\x7f"))
+    world.links["field"].received(command, None)
+    assert world.wires("yard") == [plain.encode(psiu_hexa.packet(own, other, b""))], "a ping moves nobody"
+    assert world.wires("theirs") == world.wires("arm") == world.wires("field") == []
+    world.balances()
+    world.links["yard"].received(plain.encode(psiu_hexa.packet(other, own, b"")), None)
+    assert world.wires("yard")[1:] == [command]
+    assert world.verdicts("field") == {"delivered": 1}
+    world.balances()
+
+
+class Line(MemoryAdapter):
+    """A line of 9,600 bits a second."""
+
+    @property
+    def bits_per_second(self) -> int:
+        return 9600
+
+
+def test_our_own_questions_take_less_than_two_percent_of_a_line_whatever_others_look_for() -> None:
+    world = World()
+    world._add("line", Line())
+    world.connect("wifi", "second", "line")
+    minutes = 10
+    for number in range(minutes * 600):
+        world.now += 0.1
+        world.exchange.expire(world.now)
+        world.links["wifi"].received(wire("PC", f"GHOST{number % 50}", "parafrente", "1"), PEERS[0])
+    bits = 10 * sum(map(len, world.wires("line")))
+    assert 0.014 < bits / (9600 * 60 * minutes) < 0.02
+    assert len(world.wires("line")) + world.exchange.allowances["line"].refused == len(world.wires("second"))
+    world.balances()
+
+
+def test_who_is_told_to_ask_asks() -> None:
+    world = World()
+    world._add("line", Line())
+    world.connect("line")
+    for _ in range(100):
+        world.exchange.ask_names(world.links["line"], world.now, told=True)
+    assert len(world.wires("line")) == 100
+    world.exchange.ask_names(world.links["line"], world.now)
+    assert len(world.wires("line")) == 101, "nor is it charged for"
+
+
 def test_the_time_spent_waiting_for_a_route_counts_towards_the_age_limit(world: World) -> None:
     world.transports["second"].full = True
     world.links["wifi"].received(wire("PC", "MNERIM", "parafrente", "100"), PEERS[0])

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from typing import Any
 
 import pytest
@@ -19,7 +19,7 @@ from psiu_broker.config.tables import (
     RobotConfiguration,
     ZenohConfiguration,
 )
-from psiu_broker.errors import CallError
+from psiu_broker.errors import CallError, LinkLost
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import Address, Way
 from psiu_broker.link import Link
@@ -54,15 +54,30 @@ def arm_says(payload: bytes) -> bytes:
     return codec_of(far_end).encode(psiu_hexa.packet(Address.numbered(0x12), Address.numbered(0), payload))
 
 
+def field_says(number: int, payload: bytes) -> bytes:
+    """What an ad-hoc robot tells the broker."""
+    ours = psiu_hexa.packet(Address.numbered(number), Address.numbered(0), payload)
+    return codec_of(configuration(protocol="psiu-hexa")).encode(ours)
+
+
 def said(transport: MemoryTransport) -> list[str]:
     """Destination, message and sender of each frame written."""
     return [" ".join((part := data.decode().split())[:1] + part[2:-1]) for data in transport.wires]
 
 
 class Lab:
-    """A resident between links of lists; `BRACO` is at the end of a link `arm` if there is one."""
+    """A resident between links of lists; `BRACO` is at the end of a link `arm` if there is one.
 
-    def __init__(self, *links: LinkConfiguration, name: str = "base", braco: str = "BRACO") -> None:
+    The numbers of `robots_of_bytes` are on a link `field`.
+    """
+
+    def __init__(
+        self,
+        *links: LinkConfiguration,
+        name: str = "base",
+        braco: str = "BRACO",
+        robots_of_bytes: Iterable[int] = (),
+    ) -> None:
         own = {Address.named(name): "psiu-ascii"}
         robots: dict[str, RobotConfiguration] = {}
         bindings: tuple[Binding, ...] = ()
@@ -71,6 +86,10 @@ class Lab:
             own[Address.numbered(0)] = "psiu-hexa"
             robots[braco] = RobotConfiguration(braco, "arm", "psiu-hexa", number, None, NODES, "node-0")
             bindings = (Binding(Address.named(braco), number, Way("arm"), "psiu-hexa"),)
+        if any(link.name == "field" for link in links):
+            own[Address.numbered(0)] = "psiu-hexa"
+        for each in robots_of_bytes:
+            bindings += (Binding(Address.named(f"R{each}"), Address.numbered(each), Way("field"), "psiu-hexa"),)
         self.router = Router(own, bindings, identity, heard=self._heard)
         self.exchange = Exchange(Address.named(name), self.router)
         made = Configuration(
@@ -116,7 +135,7 @@ class Labs:
     def __init__(self) -> None:
         self.all: list[Lab] = []
 
-    def __call__(self, *links: LinkConfiguration, **names: str) -> Lab:
+    def __call__(self, *links: LinkConfiguration, **names: Any) -> Lab:
         self.all.append(Lab(*links, **names))
         return self.all[-1]
 
@@ -284,6 +303,51 @@ async def test_the_robots_of_a_group_answer_our_question_from_their_own_addresse
     assert said(lab.far["wifi"]) == ["?? qualseunome base"]
     lab.hears("wifi", wire("BETA", "base", "qualseunome"), peer)
     assert said(lab.far["wifi"])[1:] == ["BETA qualseunome base"]
+
+
+class SlowLine(MemoryAdapter):
+    @property
+    def bits_per_second(self) -> int:
+        return 2400
+
+
+async def test_a_line_that_comes_and_goes_is_greeted_in_moderation(labs: Labs) -> None:
+    lab = labs(words("radio", SlowLine(), greet=True))
+    greetings = said(lab.far["radio"])
+    assert greetings == ["?? qualseunome base"]
+    for _ in range(50):
+        lab.links["radio"].lost(LinkLost("unplugged"))
+        lab.connect("radio", MemoryTransport())
+        greetings += said(lab.far["radio"])
+    assert 1 < len(greetings) < 5
+    assert lab.exchange.allowances["radio"].refused == 51 - len(greetings)
+
+
+async def test_the_robots_of_bytes_on_a_line_are_greeted_as_far_as_its_rate_allows(labs: Labs) -> None:
+    link = configuration("field", "psiu-hexa", SlowLine(), None, greet=True)
+    lab = labs(link, robots_of_bytes=range(1, 100))
+    await settled()
+    assert 1 < len(lab.far["field"].wires) < 20
+
+
+async def test_a_number_that_nobody_heard_is_pinged_and_then_told(labs: Labs) -> None:
+    lab = labs(configuration("field", "psiu-hexa", None, None, greet=False))
+    call = asyncio.ensure_future(lab.call("0x09", "ping"))
+    await settled()
+    ping = bytes.fromhex("000904")
+    assert [data[:3] for data in lab.far["field"].wires] == [ping]
+    lab.hears("field", field_says(9, b""))
+    await settled()
+    assert [data[:3] for data in lab.far["field"].wires] == [ping] * 2, "the call's own; its answer was not answered"
+    lab.hears("field", field_says(9, b""))
+    assert (await call).status == "sucesso"
+
+
+async def test_a_number_is_unknown_at_once_where_nobody_can_be_pinged(labs: Labs) -> None:
+    lab = labs(words())
+    begun = time.monotonic()
+    assert await refused(lab.call("0x09", "ping")) == "unknown_robot"
+    assert time.monotonic() - begun < 0.5
 
 
 async def test_naks_to_many_peers_are_remembered_in_bounds(labs: Labs) -> None:

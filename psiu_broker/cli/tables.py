@@ -132,6 +132,8 @@ def show_links(found: Links, *, drawn: bool) -> None:
         for _, link in found:
             if link.reason:
                 click.echo(f"{link.name} is {link.state}: {printable(link.reason)}")
+            if link.unasked:
+                click.echo(f"{link.name}: {link.unasked} questions of its own left unasked, to spare the line")
         return
     print_rows(
         (link.name, link.adapter, link.protocol, link.state, link.reason, link.robots, link.frames_in, link.frames_out,

@@ -60,6 +60,8 @@ class Port(NamedTuple):
     """Every far end of the link, now."""
     wildcard: bool = True
     """Whether questions to everyone go out on it."""
+    domain: str | None = None
+    """Whose PSIU HEXA numbers can be asked for on it; None: nobody's."""
 
 
 class Router:
@@ -121,8 +123,8 @@ class Router:
             return Decision("flood", self._everyone(protocol, arrived))
         target = self._routes.get(destination)
         if target is None:
-            # Only names can be asked for; a PSIU HEXA number is found by its own first packet.
-            hops = () if destination.is_numbered else self._everyone(protocol, arrived)
+            domain = destination.domain if destination.is_numbered else None
+            hops = self._everyone(protocol, arrived, domain)
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
@@ -249,11 +251,12 @@ class Router:
         ways = self.ports[target.way.link].ways()
         return ways if target.way.peer is None else tuple(way for way in ways if way == target.way)
 
-    def _everyone(self, protocol: str, arrived: Way) -> tuple[Way, ...]:
+    def _everyone(self, protocol: str, arrived: Way, domain: str | None = None) -> tuple[Way, ...]:
         return tuple(
             way
             for port in self.ports.values()
             if port.protocol in (protocol, ANY) and port.wildcard and not port.link == MESH == arrived.link
+            if port.domain == domain
             for way in port.ways()
             if way != arrived
         )

@@ -112,8 +112,16 @@ def test_an_unknown_robot_is_asked_for_on_the_links_that_speak_its_protocol(rout
     assert set(decision.hops) == {RADIO, LAPTOP}
 
 
-def test_a_number_cannot_be_asked_for(router: Router) -> None:
+def test_a_number_cannot_be_asked_for_where_packets_name_nobody(router: Router) -> None:
     assert router.decide(Address.numbered(9), "psiu-hexa", PHONE).verdict == "no_route"
+
+
+def test_a_number_is_asked_for_on_the_other_links_of_its_domain(router: Router) -> None:
+    for name, domain in (("field", ""), ("yard", ""), ("theirs", "red")):
+        router.link_up(Port(name, "psiu-hexa", lambda name=name: (Way(name),), domain=domain))  # type: ignore[misc]
+    decision = router.decide(Address.numbered(9), "psiu-hexa", Way("field"))
+    assert (decision.action, decision.hops) == ("ask", (Way("yard"),))
+    assert router.decide(Address.numbered(9, "red"), "psiu-hexa", SELF).hops == (Way("theirs"),)
 
 
 def test_without_anybody_to_ask_there_is_no_route(router: Router) -> None:
