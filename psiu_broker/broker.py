@@ -9,6 +9,7 @@ from typing import Any, Final
 from psiu_broker import __version__
 from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.keys import Keys
+from psiu_broker.bus.mesh import ZenohMesh
 from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.round_trip import RoundTrip
@@ -18,19 +19,25 @@ from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config import Configuration, LinkConfiguration, TrunkConfiguration
-from psiu_broker.errors import BusError
+from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange, NoBus
-from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.frame import MESH, Address, Frame, Way
 from psiu_broker.link import Link
+from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
+from psiu_broker.mesh.neighbour import Neighbours
+from psiu_broker.mesh.quality import Qualities
 from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Why
 from psiu_broker.messages import Link as LinkMessage
+from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.profiles import Node, describe
 from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
 from psiu_broker.routing.duplicates import Duplicates
+from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.router import SELF, Router
+from psiu_broker.routing.verdicts import Verdict
 from psiu_broker.trunk import Endpoints, Trunks
 
 log = logging.getLogger(__name__)
@@ -58,15 +65,26 @@ class Broker:
             for robot in configuration.robots.values()
         )
         slowest_s = max((link.options.max_age_s for link in configuration.links.values()), default=0.0)
+        duplicates = Duplicates(slowest_s + DOUBLES_MARGIN_S)
+        neighbours = Neighbours()
+        self._ownership = Ownership(
+            configuration.broker.name, neighbours.alive, duplicates.heard_here, self._heard_of_another
+        )
         router = Router(
             self._own_addresses(),
             bindings,
             identity,
             self._robot_heard,
             self._robot_gone,
-            Duplicates(slowest_s + DOUBLES_MARGIN_S),
+            duplicates,
+            self._ownership,
         )
         self.exchange = Exchange(self._own_name, router)
+        self._qualities = Qualities()
+        self.mesh = Mesh(
+            configuration.broker.name, self, router, self._ownership, neighbours, self._qualities.of, identity
+        )
+        self.exchange.join(self.mesh, MAX_AGE_S)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
         self._trunks = Trunks(configuration.broker.name, configuration.trunks.values())
         self.report = Report(configuration.broker.name, self.exchange, self.resident.commands, self._trunks)
@@ -102,6 +120,7 @@ class Broker:
         """Refuse new calls, let what waits go out, close the links, then the bus."""
         if self._bus is not None:
             await self._bus.calls.close()
+            await self._bus.mesh.close()
         await self.resident.close()
         try:
             async with asyncio.timeout(DRAIN_S):
@@ -161,6 +180,7 @@ class Broker:
         return {
             "broker": configuration.broker.model_dump(mode="json"),
             "zenoh": configuration.zenoh.model_dump(mode="json"),
+            "mesh": configuration.mesh.model_dump(mode="json"),
             "links": {name: _link_table(link) for name, link in configuration.links.items()},
             "trunks": {name: _trunk_table(trunk) for name, trunk in configuration.trunks.items()},
             "robots": {
@@ -173,6 +193,10 @@ class Broker:
             },
         }
 
+    def mesh_seen(self) -> MeshMessage:
+        mode, bus = self.configuration.mesh.mode, self._bus
+        return self.report.mesh(self.mesh, mode, bus.session.zenoh_id if bus else "", bus.mesh.linked if bus else ())
+
     def why(self, a: Address, b: Address) -> Why:
         return self.report.why(a, b)
 
@@ -181,7 +205,7 @@ class Broker:
 
     def card(self, robot: Address) -> Card | None:
         route = self.exchange.router.find(robot)
-        return None if route is None or route.way == SELF else self.report.card(route)
+        return None if route is None or route.way.link in (SELF.link, MESH) else self.report.card(route)
 
     def cards(self) -> Mapping[Address, Card]:
         return self.report.cards()
@@ -194,13 +218,20 @@ class Broker:
 
     def _robot_heard(self, route: table.Route) -> None:
         self._list(route)
-        self._changed[route.robot] = route
+        if route.way.link != MESH:
+            self._changed[route.robot] = route
+            self.mesh.robot_heard(route, time.monotonic())
+        else:
+            self._changed.pop(route.robot, None)
+            if self._bus is not None:
+                self._bus.publisher.forget_card(route.robot)
         self.resident.robot_heard(route)
         for address in route.addresses:
             self.exchange.release(address, time.monotonic())
 
     def _robot_gone(self, route: table.Route) -> None:
         self._changed.pop(route.robot, None)
+        self.mesh.robot_gone(route)
         self.resident.robot_gone(route)
         for address in route.addresses:
             directory = self._directory(address.domain)
@@ -216,6 +247,27 @@ class Broker:
                 directory.numbers.add(address.number)
             elif " " in address.name:
                 directory.names.add(address.name)
+
+    # mesh.Hub
+
+    def relayed(self, frame: Frame, way: Way, now: float, age_s: float) -> Verdict | None:
+        return self.exchange.relayed(frame, way, now, age_s)
+
+    def relay_dropped(self, verdict: Verdict) -> None:
+        self.exchange.relay_dropped(verdict)
+
+    def neighbour_came(self, name: str) -> None:
+        """Those who listen there may have been told that our robots are gone."""
+        if self._bus is not None:
+            self._bus.publisher.forget_cards()
+        self._note(self.exchange.router.robots())
+
+    def orphaned(self, robot: Address) -> None:
+        if self._bus is not None:
+            self._bus.publisher.delete_card(robot)
+
+    def _heard_of_another(self, owner: str, frame: Frame, way: Way) -> None:
+        self.mesh.notify(owner, frame, way, time.monotonic())
 
     # Inside: putting together.
 
@@ -277,9 +329,11 @@ class Broker:
         self._ticked = now
         self.exchange.expire(now)
         for link in self.exchange.links.values():
+            self._qualities.count(link.name, link.frames_in, link.malformed)
             if self._seen.get(link.name) != link.since:
                 self._seen[link.name] = link.since
                 self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
+        self.mesh.tick(now)
         if self._bus is not None:
             for robot in tuple(self._changed):
                 route = self._changed.pop(robot)  # first: one that cannot be told must not be in the way of the others
@@ -307,8 +361,16 @@ class Broker:
             log.error("not healthy: %s", ", ".join(name for name, good in checks.items() if not good))
         return Health(healthy=all(checks.values()), checks=checks)
 
-    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
-        answer = await self.resident.call(robot, command, request)
+    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer | None:
+        """None: another broker has the robot, and answers."""
+        if self._is_elsewhere(robot):
+            return None
+        try:
+            answer = await self.resident.call(robot, command, request)
+        except CallError:
+            if self._is_elsewhere(robot):
+                return None
+            raise
         self._note(self.exchange.router.robots() if command == DISCOVER else ())
         return answer
 
@@ -319,17 +381,35 @@ class Broker:
         return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
 
     async def send(self, robot: Address, command: str, request: CallRequest) -> None:
-        await self.resident.tell(robot, command, request)
+        if not self._is_elsewhere(robot):
+            await self.resident.tell(robot, command, request)
+
+    def _is_elsewhere(self, robot: Address) -> bool:
+        """Whether another broker has the robot, and its calls."""
+        route = self.exchange.router.find(robot)
+        if route is None or route.way == SELF:
+            return False
+        return route.way.link == MESH or self._ownership.owner(route.robot) not in (
+            None,
+            self.configuration.broker.name,
+        )
 
 
 class _Bus:
     """One session with everything that is declared on it."""
 
     def __init__(
-        self, session: Session, publisher: Publisher, calls: Calls, queries: Queries, round_trip: RoundTrip
+        self,
+        session: Session,
+        publisher: Publisher,
+        mesh: ZenohMesh,
+        calls: Calls,
+        queries: Queries,
+        round_trip: RoundTrip,
     ) -> None:
         self.session = session
         self.publisher = publisher
+        self.mesh = mesh
         self.calls = calls
         self.queries = queries
         self.round_trip = round_trip
@@ -340,11 +420,19 @@ class _Bus:
         zenoh = broker.configuration.zenoh
         name = broker.configuration.broker.name
         keys = Keys(zenoh.prefix)
-        session = await Session.open([*zenoh.listen, *trunks.listen], connect=trunks.connect, lost=lambda _: lost())
+        mesh = broker.configuration.mesh
+        session = await Session.open(
+            [*zenoh.listen, *trunks.listen],
+            connect=[*mesh.connect, *trunks.connect],
+            mode=mesh.mode,
+            discover=mesh.discover,
+            lost=lambda _: lost(),
+        )
         try:
             return cls(
                 session,
                 await Publisher.open(session, keys, name, _describer(broker.configuration), broker.names()),
+                await ZenohMesh.open(session, keys, name, broker.mesh),
                 await Calls.open(session, keys, broker.call, broker.send),
                 await Queries.open(session, keys, name, broker),
                 await RoundTrip.open(session, keys, name),
@@ -359,6 +447,7 @@ class _Bus:
         """Answer the calls under way and close the session, also when cancelled meanwhile."""
         try:
             await self.calls.close()
+            await self.mesh.close()
         finally:
             await self.session.close()
 

@@ -14,7 +14,7 @@ from psiu_broker.config import Configuration
 from psiu_broker.conversation import Conversations, Robot, Traffic
 from psiu_broker.errors import CallCode, CallError
 from psiu_broker.exchange import Exchange
-from psiu_broker.frame import EVERYONE, Address, Frame
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame
 from psiu_broker.messages import Answer, CallRequest, Command
 from psiu_broker.profiles import HexaProfile, Profile, PsiuProfile
 from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, listed
@@ -97,6 +97,8 @@ class Calling:
         if route.way == SELF:
             await self._told(command, request)
             return
+        if route.way.link == MESH:
+            raise _elsewhere(route)
         fresh_s = self._exchange.links[route.way.link].configuration.options.max_age_s
         if request.timeout_s is not None:
             fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
@@ -115,6 +117,8 @@ class Calling:
         Raises:
             CallError: there is no answer; its code says why.
         """
+        if route.way.link == MESH:
+            raise _elsewhere(route)
         link = self._exchange.links[route.way.link]
         if link.state != "open":
             raise CallError("link_down", f"{route.robot} is on link {link.name}, which is {link.state}: {link.reason}")
@@ -155,7 +159,10 @@ class Calling:
 
     def traffic(self, link: str) -> Traffic:
         found = self._exchange.links[link]
-        return Traffic(found.frames_out, found.last_sent)
+        if found.adapter.datagrams:
+            return Traffic(found.frames_out, found.last_sent)
+        last_heard = -inf if found.last_heard is None else found.last_heard
+        return Traffic(found.frames_out, max(found.last_sent, last_heard), found.frames_in)
 
     # Inside.
 
@@ -284,6 +291,10 @@ class Calling:
                     profile.learn(command)
         except CallError as error:
             log.info("asking %s for its commands: %s", route.robot, error)
+
+
+def _elsewhere(route: Route) -> CallError:
+    return CallError("unknown_robot", f"{route.robot} is with broker {route.way.peer}")
 
 
 def _dropped(robot: Address, verdict: Verdict) -> CallError:

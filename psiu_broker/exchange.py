@@ -7,17 +7,18 @@ from datetime import UTC, datetime
 from math import inf
 from typing import Final, Literal, Protocol, cast
 
+from psiu_broker.adapter import Peer
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.errors import EncodeError
-from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way, peer_text
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Malformed, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.routing.allowance import Allowance
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate
-from psiu_broker.routing.router import DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
+from psiu_broker.routing.router import ANY, DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
 from psiu_broker.routing.verdicts import (
     ANSWERED,
     DELIVERED,
@@ -76,6 +77,9 @@ class Resident(Protocol):
     def asked_names(self, ways: Iterable[Way], now: float) -> None:
         """The broker has just asked who is there: the next qualseunome or ping from each robot is its answer."""
 
+    def delivered(self, frame: Frame, now: float) -> None:
+        """A frame of the broker's own has left, at once or after it waited; told for each copy that waited."""
+
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         """A frame of the broker's own that waited was dropped."""
 
@@ -83,9 +87,22 @@ class Resident(Protocol):
 
     def link_closed(self, link: Link, now: float) -> None: ...
 
+    def peer_lost(self, way: Way, now: float) -> None: ...
+
+
+class Outlet(Protocol):
+    """Where a frame can leave: a link, or the mesh."""
+
+    def offer(
+        self, frame: Frame, peer: Peer, arrived: Way, now: float, patience_s: float = inf, fate: Fate | None = None
+    ) -> Verdict | None:
+        """As `Link.offer`."""
+
+    def ways(self) -> tuple[Way, ...]: ...
+
 
 class Exchange:
-    """Moves frames between links; implements `link.Hub`.
+    """Moves frames between links and other brokers; implements `link.Hub`.
 
     For each link, and for the broker's own frames under `SELF`, at every moment:
     arrived = settled (delivered, answered, dropped) + waiting.
@@ -100,6 +117,8 @@ class Exchange:
     ) -> None:
         self.bus: Bus = NoBus()
         self.links: dict[str, Link] = {}
+        self._outlets: dict[str, Outlet] = {}
+        """The links, and the mesh."""
         self.accounts: dict[str, Account] = {SELF.link: Account()}
         self.allowances: dict[str, Allowance] = {}
         """For what the broker asks on each link without having been told to."""
@@ -115,7 +134,7 @@ class Exchange:
 
     def add(self, link: Link) -> None:
         """Take in a link; its books start now."""
-        self.links[link.name] = link
+        self.links[link.name] = self._outlets[link.name] = link
         self.accounts[link.name] = Account()
         self.allowances[link.name] = Allowance(link.adapter.bits_per_second)
         options = link.configuration.options
@@ -124,6 +143,14 @@ class Exchange:
         )
         self._route_age_s[link.name] = options.route_age_s
         self._max_age_s[link.name] = options.max_age_s
+
+    def join(self, mesh: Outlet, max_age_s: float) -> None:
+        """Take in the other brokers, as far ends of the link `MESH`."""
+        self._outlets[MESH] = mesh
+        self.accounts[MESH] = Account()
+        self._route_age_s[MESH] = inf
+        self._max_age_s[MESH] = max_age_s
+        self.router.link_up(Port(MESH, ANY, mesh.ways))
 
     def heard(self, frame: Frame, way: Way, now: float, patience_s: float = inf) -> Verdict | None:
         """A frame from a robot (or, by the way SELF, from the broker): decide, move, count, tell the bus.
@@ -136,7 +163,7 @@ class Exchange:
         decision = self.router.route(frame, way, now)
         only = decision.only
         if only is not None:
-            verdict = self.links[only.link].offer(frame, only.peer, way, now, patience_s)
+            verdict = self._outlets[only.link].offer(frame, only.peer, way, now, patience_s)
             if bus.listened:
                 self._publish(frame, decision.hops, way)
         else:
@@ -150,6 +177,31 @@ class Exchange:
                 self._tap("in", way, verdict, frame)
         return verdict
 
+    def relayed(self, frame: Frame, way: Way, now: float, age_s: float) -> Verdict | None:
+        """A frame came from another broker `age_s` after its robot sent it; told to the bus there, not here."""
+        account = self.accounts[MESH]
+        account.arrived += 1
+        decision = self.router.route(frame, way, now)
+        patience_s = min((self._max_age_s[hop.link] for hop in decision.hops), default=inf) - age_s
+        verdict: Verdict | None
+        if patience_s <= 0:
+            verdict = EXPIRED
+        elif decision.action == "ask":
+            verdict = self._ask(frame, decision.hops, way, now, age_s)
+        else:
+            verdict = self._carry_out(decision, frame, way, now, patience_s)
+        if verdict is not None:
+            account.fates[verdict] += 1
+            if self.bus.raw_listened:
+                self._tap("in", way, verdict, frame)
+        return verdict
+
+    def relay_dropped(self, verdict: Verdict) -> None:
+        """Something came from another broker that is no frame for us."""
+        account = self.accounts[MESH]
+        account.arrived += 1
+        account.fates[verdict] += 1
+
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         account = self.accounts[way.link]
         account.arrived += 1
@@ -161,9 +213,12 @@ class Exchange:
     def send(self, frame: Frame, now: float, patience_s: float = inf) -> Verdict | None:
         """Send a frame of the broker's own; its verdict, or None while it waits, for at most `patience_s`.
 
-        What waits and is dropped after all is told to `Resident.undelivered`.
+        When it leaves is told to `Resident.delivered`; that it waited and is dropped to `Resident.undelivered`.
         """
-        return self.heard(frame, SELF, now, patience_s)
+        verdict = self.heard(frame, SELF, now, patience_s)
+        if verdict is DELIVERED:
+            self.resident.delivered(frame, now)
+        return verdict
 
     def ask_names(self, link: Link, now: float, *, told: bool = False) -> None:
         """Ask everyone on one link who they are; unless we were told to, only where our allowance has room."""
@@ -172,7 +227,8 @@ class Exchange:
     def ask_for(self, robot: Address, now: float) -> bool:
         """Ask for a robot on every link where it may hear its name or number; False if there is none."""
         protocol = psiu_hexa.PROTOCOL if robot.is_numbered else psiu_ascii.PROTOCOL
-        hops = self.router.decide(robot, protocol, SELF).hops
+        # Other brokers announce theirs.
+        hops = [hop for hop in self.router.decide(robot, protocol, SELF).hops if hop.link != MESH]
         self._ask_on(robot, hops, now)
         return bool(hops)
 
@@ -181,6 +237,8 @@ class Exchange:
         return self._may_say(self._question(robot, link), link, now, times)
 
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None:
+        if verdict is DELIVERED and fate.arrived is SELF:
+            self.resident.delivered(fate.frame, now)
         final = fate.settle(verdict)
         if final is not None:
             self.accounts[fate.arrived.link].fates[final] += 1
@@ -202,6 +260,7 @@ class Exchange:
 
     def peer_lost(self, way: Way, now: float) -> None:
         self.router.peer_lost(way, now)
+        self.resident.peer_lost(way, now)
 
     def release(self, robot: Address, now: float) -> None:
         """`robot` has been heard: move the frames that waited for it."""
@@ -284,22 +343,28 @@ class Exchange:
         fate = Fate(frame, way, len(hops))
         final: Verdict | None = None
         for hop in hops:
-            verdict = self.links[hop.link].offer(frame, hop.peer, way, now, patience_s, fate)
+            verdict = self._outlets[hop.link].offer(frame, hop.peer, way, now, patience_s, fate)
             if verdict is not None:
                 final = fate.settle(verdict)
         return final
 
     def _publish(self, frame: Frame, hops: tuple[Way, ...], way: Way) -> None:
-        """Tell the bus of `frame`; of our own with the bytes that its first hop carries."""
-        if not frame.wire and hops:
+        """Tell the bus of `frame`; of our own with the bytes that its first hop carries.
+
+        What the robot of another broker says is told there.
+        """
+        if self.router.is_elsewhere(frame.source):
+            return
+        link = next((self.links[hop.link] for hop in hops if hop.link != MESH), None)
+        if not frame.wire and link is not None:
             with suppress(EncodeError):
-                frame = frame._replace(wire=self.links[hops[0].link].codec.encode(frame))
+                frame = frame._replace(wire=link.codec.encode(frame))
         self.bus.publish(frame, way, self._wall_clock())
 
-    def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float) -> Verdict | None:
-        """Hold a frame for an unknown robot, and ask for the robot."""
+    def _ask(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, age_s: float = 0.0) -> Verdict | None:
+        """Hold a frame, which is `age_s` old, for an unknown robot, and ask for the robot."""
         robot = frame.destination
-        if way is SELF or not self.holding.add(frame, way, now):
+        if way is SELF or not self.holding.add(frame, way, now - age_s):
             return NO_ROUTE
         if self.holding.is_due(robot, now) and self._may_search(frame, now):
             self.holding.asked(robot, now)

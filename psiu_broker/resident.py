@@ -70,7 +70,8 @@ class Resident:
         reply = self._responder.answer(frame, now, self._conversations.pinging(frame.source))
         if reply is None:
             return
-        if frame.destination == EVERYONE and not self._exchange.links[way.link].adapter.datagrams:
+        link = self._exchange.links.get(way.link)  # none: it came from another broker
+        if frame.destination == EVERYONE and link is not None and not link.adapter.datagrams:
             delay_s = random.uniform(0, ANSWER_DELAY_S)  # noqa: S311 - keeps robots apart, no secret
             asyncio.get_running_loop().call_later(delay_s, self._say, reply)
         else:
@@ -98,6 +99,9 @@ class Resident:
     def asked_names(self, ways: Iterable[Way], now: float) -> None:
         self._asked.update({way.link: _Asked(now) for way in ways})
 
+    def delivered(self, frame: Frame, now: float) -> None:
+        self._conversations.delivered(frame, now)
+
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self._calling.undelivered(frame, verdict)
 
@@ -117,6 +121,9 @@ class Resident:
 
     def link_closed(self, link: Link, now: float) -> None:
         self._conversations.link_down(link.name, link.reason or "closed")
+
+    def peer_lost(self, way: Way, now: float) -> None:
+        self._conversations.link_down(way.link, "its far end is gone", way.peer)
 
     # What the broker tells us.
 

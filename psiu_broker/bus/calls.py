@@ -26,8 +26,8 @@ from psiu_broker.routing.outbox import is_stop
 
 logger = logging.getLogger(__name__)
 
-Call = Callable[[Address, str, CallRequest], Awaitable[Answer]]
-"""Send a command and wait for the robot's answer; raises CallError."""
+Call = Callable[[Address, str, CallRequest], Awaitable[Answer | None]]
+"""Send a command and wait for the robot's answer; None where that is for another broker to do. Raises CallError."""
 
 Send = Callable[[Address, str, CallRequest], Awaitable[None]]
 """Send a command and go on; raises CallError."""
@@ -165,7 +165,7 @@ class Calls:
             logger.exception("a call to %s %s failed inside the broker", accepted.robot, accepted.command)
             failed = CallError("outcome_unknown", f"the broker failed ({type(error).__name__}); its log says how")
             return self._replies.refuse(query, failed)
-        return self._replies.answer(query, {accepted.key: (_ANSWER, answer)})
+        return self._replies.answer(query, {} if answer is None else {accepted.key: (_ANSWER, answer)})
 
     async def _serve_put(self, accepted: _Accepted) -> None:
         try:

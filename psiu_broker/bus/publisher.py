@@ -120,14 +120,26 @@ class Publisher:
         except BaseException as error:
             self._failed(error)
 
+    def forget_card(self, robot: Address) -> None:
+        """The card is another broker's from now on."""
+        self._cards.pop(robot, None)
+
+    def forget_cards(self) -> None:
+        """Put every card again when it is published next, whether it has changed or not."""
+        self._cards = dict.fromkeys(self._cards, b"")
+
     def withdraw_card(self, robot: Address) -> None:
+        """Delete the card of a robot that is gone, if it was put by us."""
+        if self._cards.pop(robot, None) is not None:
+            self.delete_card(robot)
+
+    def delete_card(self, robot: Address) -> None:
         """Delete the card of a robot that is gone."""
         try:
-            if self._cards.pop(robot, None) is not None:
-                self._session.zenoh.delete(
-                    self._keys.card(robot), congestion_control=zenoh.CongestionControl.DROP, priority=PRIORITY
-                )
-                self.puts += 1
+            self._session.zenoh.delete(
+                self._keys.card(robot), congestion_control=zenoh.CongestionControl.DROP, priority=PRIORITY
+            )
+            self.puts += 1
         except BaseException as error:
             self._failed(error)
 

@@ -28,6 +28,7 @@ from psiu_broker.config.tables import (
     Configuration,
     LinkConfiguration,
     LinkOptions,
+    MeshConfiguration,
     RobotConfiguration,
     RobotTable,
     TrunkConfiguration,
@@ -80,12 +81,13 @@ def _syntax(path: Path, message: str) -> str:
 
 def _configuration(document: dict[str, Any], file: str, problems: Problems) -> Configuration | None:
     """What the file says; None where it is wrong, with every mistake noted."""
-    sections = ("broker", "zenoh", "links", "trunks", "robots")
+    sections = ("broker", "zenoh", "mesh", "links", "trunks", "robots")
     for name in document:
         if name not in sections:
             problems.unknown((name,), sections)
     broker = problems.read(BrokerConfiguration, document.get("broker", {}), ("broker",))
     zenoh = problems.read(ZenohConfiguration, document.get("zenoh", {}), ("zenoh",))
+    mesh = problems.read(MeshConfiguration, document.get("mesh", {}), ("mesh",))
     own_address = broker.address if broker else 0
     robots_written = problems.table(document.get("robots", {}), ("robots",)) or {}
     links_written = problems.table(document.get("links", {}), ("links",)) or {}
@@ -97,10 +99,10 @@ def _configuration(document: dict[str, Any], file: str, problems: Problems) -> C
     whole_robots = {name: robot for name, robot in robots.items() if robot}
     check_devices(whole_links.values(), trunks.values(), problems)
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
-    if broker is None or zenoh is None or problems.lines:
+    if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
     warnings = warnings_about(file, zenoh, whole_links.values())
-    return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks)
+    return Configuration(broker, zenoh, mesh, whole_links, whole_robots, warnings, trunks)
 
 
 def _link(

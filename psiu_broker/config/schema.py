@@ -5,7 +5,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from psiu_broker.codecs import CODECS
-from psiu_broker.config.tables import LINK_NAME, BrokerConfiguration, LinkOptions, RobotTable, ZenohConfiguration
+from psiu_broker.config.tables import (
+    LINK_NAME,
+    BrokerConfiguration,
+    LinkOptions,
+    MeshConfiguration,
+    RobotTable,
+    ZenohConfiguration,
+)
 from psiu_broker.registry import adapter_class, adapter_names
 
 
@@ -51,6 +58,7 @@ def json_schema() -> dict[str, Any]:
         "properties": {
             "broker": schema(BrokerConfiguration),
             "zenoh": schema(ZenohConfiguration),
+            "mesh": schema(MeshConfiguration),
             "links": {
                 "type": "object",
                 "propertyNames": names,

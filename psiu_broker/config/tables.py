@@ -46,6 +46,10 @@ def _endpoint(endpoint: str) -> str:
 def _endpoints(endpoints: tuple[str, ...]) -> tuple[str, ...]:
     if not endpoints:
         raise ValueError("expected at least one place, got none; leave listen out for tcp/127.0.0.1:7447")
+    return _once(endpoints)
+
+
+def _once(endpoints: tuple[str, ...]) -> tuple[str, ...]:
     for position, endpoint in enumerate(endpoints):
         if endpoint in endpoints[:position]:
             raise ValueError(f"{got(endpoint)} is there twice; remove one")
@@ -68,6 +72,7 @@ Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Endpoints = Annotated[
     tuple[Endpoint, ...], AfterValidator(_endpoints), Field(json_schema_extra={"minItems": 1, "uniqueItems": True})
 ]
+Others = Annotated[tuple[Endpoint, ...], AfterValidator(_once), Field(json_schema_extra={"uniqueItems": True})]
 Prefix = Annotated[str, AfterValidator(_prefix)]
 Number = Annotated[int, Field(ge=0, le=255)]
 SensorReply = Literal["node-0", "bit7"]
@@ -90,6 +95,16 @@ class ZenohConfiguration(_Table):
 
     listen: Endpoints = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
     prefix: Prefix = Field("psiu", description="the first part of every key")
+
+
+class MeshConfiguration(_Table):
+    """``[mesh]``: other brokers, and how they are reached. Others may connect to us all the same where it is absent."""
+
+    mode: Literal["peer", "router"] = Field(
+        "peer", description='"peer": every broker reaches every other; "router": Zenoh relays where they do not'
+    )
+    connect: Others = Field((), description="where other brokers listen; they may be down now")
+    discover: bool = Field(False, description="find other brokers on the local network by multicast")
 
 
 class LinkOptions(_Table):
@@ -161,6 +176,7 @@ class Configuration:
 
     broker: BrokerConfiguration
     zenoh: ZenohConfiguration
+    mesh: MeshConfiguration
     links: Mapping[str, LinkConfiguration]
     robots: Mapping[str, RobotConfiguration]
     warnings: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ again, because Zenoh itself relays between brokers. What is known comes from ann
 
 import logging
 import secrets
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from math import inf
 from typing import Final, Protocol
 
@@ -356,6 +356,15 @@ class Mesh:
             self._beat(now)
             self._set_right(now)
             self._guard(now)
+
+    def conflicts(self, now: float) -> Iterator[tuple[str, set[str], float, str]]:
+        """Names that more than one robot or broker has: the name, at which brokers, since when, and what it means."""
+        for conflict in self.ownership.conflicts.values():
+            detail = "robots of this name talk at each of these brokers by turns; rename one of them"
+            yield str(conflict.robot), conflict.brokers, conflict.since, detail
+        for since in self.namesakes.values():
+            if now - since > NAMESAKE_S:
+                yield self.own, {self.own}, since, "another broker has this name too; rename one of them in [broker]"
 
     # Inside.
 

@@ -41,13 +41,12 @@ class Duplicates:
         if seen is hearing:
             before = self._old.get(key)
             if before is not None and self._is_another(before, way, now):
-                del new[key]
+                new[key] = self._leading(before, way)
                 return True
             if len(new) >= self._capacity:
                 self._until = -inf
         elif seen[0] is not way and self._is_another(seen, way, now):
-            if seen[0].link == MESH:
-                new[key] = (way, seen[1])  # quicker by another broker, and ours all the same: our link leads
+            new[key] = self._leading(seen, way)
             return True
         else:
             new[key] = hearing
@@ -57,6 +56,10 @@ class Duplicates:
         """Whether a link of ours, and not only another broker, brought the frame `key`."""
         seen = self._new.get(key) or self._old.get(key)
         return seen is not None and seen[0].link != MESH
+
+    def _leading(self, seen: tuple[Way, float], way: Way) -> tuple[Way, float]:
+        """The way that leads from now on: a link of ours before another broker, however quick that was."""
+        return (way, seen[1]) if seen[0].link == MESH else seen
 
     def _is_another(self, seen: tuple[Way, float], way: Way, now: float) -> bool:
         """Whether what was `seen` came by another way than `way`, and so lately that this is its double."""
