@@ -4,7 +4,6 @@ import asyncio
 from types import TracebackType
 from typing import Self
 
-
 Ends = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
@@ -33,6 +32,11 @@ class Relay:
         self.cut()
         if self._tasks:
             await asyncio.wait(self._tasks)
+
+    @property
+    def serving(self) -> bool:
+        """Whether it takes calls."""
+        return bool(self._servers)
 
     async def restore(self) -> None:
         """Take calls (again)."""

@@ -163,6 +163,9 @@ class Serial(Adapter):
                 port.dtr = self.dtr
             if self.rts is not None:
                 port.rts = self.rts
+            if self.scheme == "socket":
+                # Else pyserial throws away what the far end says between connecting and its last step of opening.
+                port.reset_input_buffer = _nothing  # type: ignore[method-assign]
             port.open()
         except LinkError:
             raise
@@ -234,6 +237,9 @@ class _SerialTransport(DescriptorTransport):
 
     def status(self) -> Mapping[str, str | int | float]:
         return self._facts
+
+
+def _nothing() -> None: ...
 
 
 def _has_descriptor(port: serial.Serial) -> bool:

@@ -52,6 +52,8 @@ class Trunk(Kept):
     # What the transport tells us: adapter.Receiver.
 
     def received(self, data: bytes, peer: Peer) -> None:
+        if self._lost is None or self._lost.done():
+            return  # a channel has failed, and its transport is not closed yet
         self.bytes_in += len(data)
         (self._channels.get(peer) or self._channel(peer)).received(data)
 

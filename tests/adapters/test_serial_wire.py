@@ -3,6 +3,7 @@
 import asyncio
 import fcntl
 import os
+import select
 import threading
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from adapter_contract import FRAME, Recorder, open_descriptors
 from pty_robot import Pty
+from serial.urlhandler import protocol_socket
 
 from psiu_adapters.serial import Serial
 from psiu_broker.errors import LinkAbsent, LinkError
@@ -129,6 +131,28 @@ class TestUrls:
         await writer.wait_closed()
         await recorder.until(lambda: recorder.losses)
         await transport.close()
+        server.close()
+        await server.wait_closed()
+
+    async def test_nothing_is_lost_that_a_network_port_says_while_it_is_opened(
+        self, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def has_spoken(port: protocol_socket.Serial) -> None:
+            assert select.select([port._socket], [], [], 5)[0]
+
+        monkeypatch.setattr(protocol_socket.Serial, "_reconfigure_port", has_spoken)
+        ends: list[asyncio.StreamWriter] = []
+
+        def speak(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            ends.append(writer)
+            writer.write(FRAME)
+
+        server = await asyncio.start_server(speak, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        transport = await Serial(device=f"socket://127.0.0.1:{port}").open(recorder)
+        await recorder.until(lambda: recorder.data == FRAME)
+        await transport.close()
+        ends[0].close()
         server.close()
         await server.wait_closed()
 

@@ -13,7 +13,9 @@ import zenoh
 from stream_relay import Relay
 
 from psiu_broker.broker import Broker
+from psiu_broker.bus.session import Session
 from psiu_broker.config import load
+from psiu_broker.errors import BusError
 
 CONFIGURATION = """
 [broker]
@@ -23,11 +25,16 @@ listen = ["tcp/127.0.0.1:{bus}"]
 [trunks.far]
 adapter = "serial"
 device = "socket://127.0.0.1:{stream}"
+[links.wifi]
+adapter = "udp"
+listen = "127.0.0.1:{wifi}"
+protocol = "psiu-ascii"
 """
+FORWARD = b"MNERIM 034 parafrente 100 PC 02123"
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
@@ -44,18 +51,27 @@ class Lab:
 
     def __init__(self, folder: Path, relay: Relay) -> None:
         self.relay = relay
-        self.brokers = []
-        for name, stream in zip(("base", "hill"), relay.ports, strict=True):
-            file = folder / f"{name}.toml"
-            file.write_text(CONFIGURATION.format(name=name, bus=free_port(), stream=stream))
-            self.brokers.append(Broker(load(file)))
-        self.base, self.hill = self.brokers
+        self.wifi = free_port(socket.SOCK_DGRAM)
+        self.files = [folder / "base.toml", folder / "hill.toml"]
+        for file, stream in zip(self.files, relay.ports, strict=True):
+            text = CONFIGURATION.format(name=file.stem, bus=free_port(), stream=stream, wifi=self.wifi)
+            file.write_text(text if file.stem == "hill" else text.partition("[links")[0])
+        self.brokers = [Broker(load(file)) for file in self.files]
+
+    @property
+    def base(self) -> Broker:
+        return self.brokers[0]
+
+    @property
+    def hill(self) -> Broker:
+        return self.brokers[1]
 
     def states(self) -> list[tuple[str, str | None]]:
         return [(trunk.state, trunk.far) for broker in self.brokers for trunk in broker.trunks()]
 
-    async def open(self) -> None:
-        await until(lambda: self.states() == [("open", "hill"), ("open", "base")])
+    def peers(self) -> list[str]:
+        """The Zenoh sessions that those of the brokers are connected with, programs aside."""
+        return [str(each) for broker in self.brokers for each in session_of(broker).zenoh.info.peers_zid()]
 
     async def known(self, broker: Broker) -> set[str]:
         """The brokers that a program at `broker` reaches."""
@@ -69,6 +85,19 @@ class Lab:
                 while len(await self.known(broker)) < 2:  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
         return time.monotonic() - begun
+
+
+def session_of(broker: Broker) -> Session:
+    bus = broker._bus
+    assert bus is not None
+    return bus.session
+
+
+def lose_session(broker: Broker) -> None:
+    """As after a panic inside Zenoh."""
+    session = session_of(broker)
+    session.is_lost = True
+    broker._bus_lost.set()
 
 
 def connected(broker: Broker) -> zenoh.Session:
@@ -110,3 +139,69 @@ async def test_programs_at_either_end_reach_both_brokers(lab: Lab) -> None:
     for broker in lab.brokers:
         assert await lab.known(broker) == {"psiu/@broker/base/status", "psiu/@broker/hill/status"}
         assert await broker.healthy()
+    assert [link.state for link in lab.hill.links()] == ["open"]
+
+
+async def test_what_a_robot_says_at_one_end_is_heard_at_the_other(lab: Lab) -> None:
+    await lab.meet()
+    session = await asyncio.to_thread(connected, lab.base)
+    heard: list[str] = []
+    try:
+        session.declare_subscriber("psiu/*/*/*", lambda sample: heard.append(str(sample.key_expr)))
+        await until(lambda: lab.hill.exchange.bus.listened)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+            robot.sendto(FORWARD, ("127.0.0.1", lab.wifi))
+            await until(lambda: "psiu/PC/MNERIM/parafrente" in heard)
+    finally:
+        await asyncio.to_thread(session.close)
+
+
+async def test_a_cut_stream_is_noticed_at_once_and_carries_again_when_it_is_back(lab: Lab, relay: Relay) -> None:
+    await lab.meet()
+    for _ in range(2):
+        relay.cut()
+        begun = time.monotonic()
+        await until(lambda: not lab.peers())
+        assert time.monotonic() - begun < 1.0, "before Zenoh's lease of 2 s"
+        assert [state for state, _ in lab.states()] == ["waiting", "waiting"]
+        assert all(str(relay.ports[0]) in str(trunk.reason) for trunk in lab.base.trunks())
+        assert await lab.base.healthy()
+        await relay.restore()
+        await lab.meet()
+        assert lab.states() == [("open", "hill"), ("open", "base")]
+
+
+async def test_a_stream_cut_in_the_middle_of_anything_carries_again(lab: Lab, relay: Relay) -> None:
+    for size in (10, 45, 70, 73, 200, 501):
+        relay.cut_at = relay.carried + size
+        await until(lambda: relay.cut_at is None or not relay.serving)
+        await relay.restore()
+    await lab.meet()
+
+
+async def test_a_broker_that_starts_again_is_met_again(lab: Lab) -> None:
+    await lab.meet()
+    for place, file in enumerate(lab.files):
+        await lab.brokers[place].stop()
+        lab.brokers[place] = Broker(load(file))
+        await lab.brokers[place].start()
+        await lab.meet()
+
+
+async def test_a_session_that_was_lost_is_replaced_without_a_new_stream(lab: Lab, relay: Relay) -> None:
+    await lab.meet()
+    for broker in lab.brokers:
+        old = broker.status().zenoh_id
+        lose_session(broker)
+        await until(lambda: broker.status().zenoh_id not in ("", old))  # noqa: B023
+        await lab.meet()
+    assert relay.joined == 1
+
+
+async def test_nothing_is_left_behind(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder := tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    broker = Broker(load(lab.files[0].with_name("base.toml")))
+    with pytest.raises(BusError, match="in use"):
+        await broker.start()
+    assert list(folder.iterdir()) == []
