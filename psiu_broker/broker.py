@@ -14,6 +14,7 @@ from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session, plain
+from psiu_broker.bus.traces import Traces
 from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
@@ -26,7 +27,7 @@ from psiu_broker.link import Link
 from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
 from psiu_broker.mesh.neighbour import Neighbours
 from psiu_broker.mesh.quality import Qualities
-from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Why
+from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Trace, Why
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
@@ -38,6 +39,7 @@ from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.router import SELF, Router
 from psiu_broker.routing.verdicts import Verdict
+from psiu_broker.tracing import Tracing
 from psiu_broker.trunk import Endpoints, Trunks
 
 log = logging.getLogger(__name__)
@@ -86,6 +88,7 @@ class Broker:
         )
         self.exchange.join(self.mesh, MAX_AGE_S)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
+        self.tracing = Tracing(configuration.broker.name, self.exchange, self.resident.call, self._broker_of)
         self._trunks = Trunks(configuration.broker.name, configuration.trunks.values())
         self.report = Report(configuration.broker.name, self.exchange, self.resident.commands, self._trunks)
         for link in configuration.links.values():
@@ -120,6 +123,7 @@ class Broker:
         """Refuse new calls, let what waits go out, close the links, then the bus."""
         if self._bus is not None:
             await self._bus.calls.close()
+            await self._bus.traces.close()
             await self._bus.mesh.close()
         await self.resident.close()
         try:
@@ -380,6 +384,17 @@ class Broker:
         robots = self.configuration.robots.values()
         return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
 
+    async def trace(self, a: Address, b: Address) -> Trace | None:
+        """None: `a` is not here."""
+        if self._bus is None or self.exchange.router.find(a) is None or self._is_elsewhere(a):
+            return None
+        return await self.tracing.trace(a, b, self._bus.traces.probe)
+
+    def _broker_of(self, zenoh_id: str) -> str:
+        """The broker with that Zenoh id; the id where there is none."""
+        known = (each.name for each in self.mesh.neighbours if each.zenoh_id.lstrip("0") == zenoh_id)
+        return next(known, zenoh_id)
+
     async def send(self, robot: Address, command: str, request: CallRequest) -> None:
         if not self._is_elsewhere(robot):
             await self.resident.tell(robot, command, request)
@@ -405,6 +420,7 @@ class _Bus:
         mesh: ZenohMesh,
         calls: Calls,
         queries: Queries,
+        traces: Traces,
         round_trip: RoundTrip,
     ) -> None:
         self.session = session
@@ -412,6 +428,7 @@ class _Bus:
         self.mesh = mesh
         self.calls = calls
         self.queries = queries
+        self.traces = traces
         self.round_trip = round_trip
 
     @classmethod
@@ -435,6 +452,7 @@ class _Bus:
                 await ZenohMesh.open(session, keys, name, broker.mesh),
                 await Calls.open(session, keys, broker.call, broker.send),
                 await Queries.open(session, keys, name, broker),
+                await Traces.open(session, keys, name, broker.trace, broker.tracing.probed),
                 await RoundTrip.open(session, keys, name),
             )
         except BaseException as error:
@@ -447,6 +465,7 @@ class _Bus:
         """Answer the calls under way and close the session, also when cancelled meanwhile."""
         try:
             await self.calls.close()
+            await self.traces.close()
             await self.mesh.close()
         finally:
             await self.session.close()

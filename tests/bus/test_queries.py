@@ -12,7 +12,7 @@ from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.session import Session
 from psiu_broker.frame import Address
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Refusal, Route, Status, Trunk, Why
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Mesh, Refusal, Route, Status, Trunk, Why
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
@@ -53,6 +53,9 @@ class Broker:
 
     def health(self) -> Health:
         return Health(healthy=True, checks={})
+
+    def mesh_seen(self) -> Mesh:
+        return Mesh(broker="base", mode="peer", zenoh_id="b")
 
     def config(self) -> Mapping[str, Any]:
         return {"broker": {"name": "base"}}
@@ -115,13 +118,15 @@ async def test_lists_are_arrays_and_times_are_rfc_3339(queries: Queries, program
 
 async def test_wildcards_get_each_answer_on_its_own_key(queries: Queries, program: zenoh.Session) -> None:
     every = {
-        f"psiu/@broker/base/{what}" for what in ("status", "links", "trunks", "routes", "ledger", "health", "config")
+        f"psiu/@broker/base/{what}"
+        for what in ("status", "links", "trunks", "routes", "ledger", "health", "mesh", "config")
     }
     assert set(await ask(program, "psiu/@broker/base/*")) == every
     assert set(await ask(program, "psiu/@broker/**")) == every
     assert set(await ask(program, "psiu/@broker/*/status")) == {"psiu/@broker/base/status"}
     assert set(await ask(program, "psiu/@broker/*/why/A/B")) == {"psiu/@broker/base/why/A/B"}
     assert await ask(program, "psiu/@broker/other/status") == {}
+    assert await ask(program, "psiu/@broker/*/trace/A/B") == {}  # `Traces` answers
 
 
 async def test_why_names_two_robots(queries: Queries, program: zenoh.Session) -> None:
