@@ -23,6 +23,7 @@ from psiu_broker.config import Configuration, LinkConfiguration, TrunkConfigurat
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange, NoBus
 from psiu_broker.frame import MESH, Address, Frame, Way
+from psiu_broker.hold_off import LastAlive
 from psiu_broker.link import Link
 from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
 from psiu_broker.mesh.neighbour import Neighbours
@@ -46,6 +47,7 @@ log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.1
 """How often what is too late is dropped and cards that changed are put."""
+LOOK_AROUND_S: Final = 0.5
 DOUBLES_MARGIN_S: Final = 2.0
 """A frame may wait its age limit in an outbox, and this long elsewhere, before its double is no longer known."""
 DRAIN_S: Final = 1.0
@@ -95,6 +97,7 @@ class Broker:
             self.exchange.add(self._link(link))
         for robot in router.robots():
             self._list(robot)
+        self._last_alive = LastAlive(configuration.broker.name) if configuration.mesh.mode == "router" else None
         self._changed: dict[Address, table.Route] = {}
         self._seen: dict[str, float] = {}
         self._ticked = time.monotonic()
@@ -110,12 +113,20 @@ class Broker:
             BusError: the bus cannot open: an endpoint in `zenoh.listen` is taken or not ours.
         """
         try:
+            if self._last_alive is not None:
+                rest_s = await self._last_alive.hold_off()
+                if rest_s:
+                    log.info("waited %.1f s: routers forget a broker that was there a moment ago", rest_s)
             await self._open_bus()
         except BaseException:
             self._trunks.close()
             raise
         create = asyncio.get_running_loop().create_task
-        self._tasks = [create(self._tick(), name="tick"), create(self._keep_bus(), name="bus")]
+        self._tasks = [
+            create(self._tick(), name="tick"),
+            create(self._look_around(), name="look around"),
+            create(self._keep_bus(), name="bus"),
+        ]
         kept = (*self.exchange.links.values(), *self._trunks)
         self._link_tasks = [create(each.run(), name=f"{each.kind} {each.name}") for each in kept]
 
@@ -327,6 +338,15 @@ class Broker:
             except Exception:  # whatever is wrong with one robot's card must not stop the clock of all
                 log.exception("a tick failed")
             await asyncio.sleep(TICK_S)
+
+    async def _look_around(self) -> None:
+        """See whom Zenoh has a link to, and note that we live."""
+        while True:
+            if self._bus is not None:
+                await self._bus.mesh.look()
+            if self._last_alive is not None:
+                self._last_alive.note()
+            await asyncio.sleep(LOOK_AROUND_S)
 
     def _look_after(self, now: float) -> None:
         """Drop what is too late, and put the cards that changed."""

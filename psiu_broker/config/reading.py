@@ -102,7 +102,7 @@ def _configuration(document: dict[str, Any], file: str, problems: Problems) -> C
     if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
     warnings = warnings_about(file, zenoh, whole_links.values())
-    return Configuration(broker, zenoh, mesh, whole_links, whole_robots, warnings, trunks)
+    return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks, mesh)
 
 
 def _link(

@@ -176,8 +176,8 @@ class Configuration:
 
     broker: BrokerConfiguration
     zenoh: ZenohConfiguration
-    mesh: MeshConfiguration
     links: Mapping[str, LinkConfiguration]
     robots: Mapping[str, RobotConfiguration]
     warnings: tuple[str, ...] = ()
     trunks: Mapping[str, TrunkConfiguration] = field(default_factory=dict)
+    mesh: MeshConfiguration = MeshConfiguration()

@@ -66,6 +66,8 @@ async def broker(session: Session, keys: Keys, sent: list[Any]) -> AsyncIterator
         links=list,
         routes=list,
         ledger=dict,
+        trunks=list,
+        mesh_seen=dict,
         health=dict,
         config=dict,
         why=lambda a, b: Why(a=str(a), b=str(b), delivered=False, verdict="no_route", steps=[]),

@@ -65,7 +65,14 @@ def stuck_s() -> float:
 async def bus(endpoint: str, keys: Keys, stuck_s: float, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Bus]:
     monkeypatch.setattr(session_module, "STUCK_S", stuck_s)
     source: Any = SimpleNamespace(
-        status=dict, links=list, routes=list, ledger=dict, health=dict, config=lambda: "x" * 100_000
+        status=dict,
+        links=list,
+        routes=list,
+        ledger=dict,
+        trunks=list,
+        mesh_seen=dict,
+        health=dict,
+        config=lambda: "x" * 100_000,
     )
     session = await Session.open([endpoint])
     calls = await Calls.open(session, keys, no_robot, no_robot)
