@@ -78,7 +78,7 @@ class Resident(Protocol):
         """The broker has just asked who is there: the next qualseunome or ping from each robot is its answer."""
 
     def delivered(self, frame: Frame, now: float) -> None:
-        """A frame of the broker's own has left, at once or after it waited; told for each copy that waited."""
+        """A frame of the broker's own has left, at once or after it waited; told for each copy."""
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         """A frame of the broker's own that waited was dropped."""
@@ -344,6 +344,8 @@ class Exchange:
         final: Verdict | None = None
         for hop in hops:
             verdict = self._outlets[hop.link].offer(frame, hop.peer, way, now, patience_s, fate)
+            if verdict is DELIVERED and way is SELF:  # while other copies may wait
+                self.resident.delivered(frame, now)
             if verdict is not None:
                 final = fate.settle(verdict)
         return final

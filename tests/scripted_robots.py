@@ -89,12 +89,23 @@ class Robots:
         if self.stuck:
             self._kept.append((now() + patience_s, frame))
             return None
+        self._leaves(frame)
+        return None
+
+    def flows(self) -> None:
+        """The links are stuck no more: what they kept leaves."""
+        self.stuck = False
+        kept, self._kept = self._kept, []
+        for _, frame in kept:
+            self._leaves(frame)
+
+    def _leaves(self, frame: Frame) -> None:
         self.sent.append((round(now() - self.begun, 6), frame.payload))
         self.another_leaves(self._links[frame.destination])
+        self.conversations.delivered(frame, now())
         for delay_s, payload in self.script(frame):
             answer = frame._replace(source=frame.destination, destination=frame.source, subject="", payload=payload)
             asyncio.get_running_loop().call_later(delay_s, self.say, answer)
-        return None
 
     def expire(self, link: str) -> None:
         late = [frame for until, frame in self._kept if until <= now() + 1e-6]
@@ -107,9 +118,13 @@ class Robots:
 
     def another_leaves(self, link: str) -> None:
         """A frame, of ours or of anybody, leaves on `link` now."""
-        self._out[link] = Traffic(self.traffic(link).frames + 1, now())
+        self._out[link] = Traffic(self.traffic(link).frames + 1, now(), self.traffic(link).heard)
+
+    def another_is_heard(self, link: str) -> None:
+        self._out[link] = Traffic(self.traffic(link).frames, now(), self.traffic(link).heard + 1)
 
     def say(self, frame: Frame) -> bool:
+        self.another_is_heard(self._links.get(frame.source, "radio"))
         return self.conversations.heard(frame, now())
 
     def says(self, payload: bytes, source: Address = ARM) -> bool:

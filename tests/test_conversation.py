@@ -161,6 +161,39 @@ async def test_a_frame_that_never_left_its_outbox_is_not_an_unknown_outcome() ->
 
 
 @jumping
+async def test_a_robot_has_its_time_from_when_the_command_leaves() -> None:
+    robots = Robots()
+    robots.stuck = True
+    robots.script = lambda _: [(1.5, b"A")]
+    call = asyncio.ensure_future(robots.hexa("garra", 45))
+    await asyncio.sleep(1.9)
+    robots.flows()
+    assert (await call).elapsed_ms == pytest.approx(3400)
+    assert robots.payloads == [b"\x04\x40"]
+
+
+@jumping
+async def test_a_robot_has_its_time_within_the_deadline_only() -> None:
+    robots = Robots()
+    robots.stuck = True
+    call = asyncio.ensure_future(robots.hexa("garra", 45, timeout_s=2))
+    await asyncio.sleep(1.5)
+    robots.flows()
+    assert (await refused(call)).code == "outcome_unknown"
+    assert now() - robots.begun == pytest.approx(2)
+
+
+@jumping
+async def test_a_link_that_goes_down_with_the_command_in_its_outbox_leaves_no_doubt() -> None:
+    robots = Robots()
+    robots.stuck = True
+    call = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0.1)
+    robots.conversations.link_down("radio", "unplugged")
+    assert "unknown" not in str(await refused(call))
+
+
+@jumping
 async def test_complaints_are_bounded() -> None:
     robots = Robots()
     robots.script = lambda _: [(0.1, b"N")]
@@ -237,6 +270,35 @@ async def test_a_busy_robot_that_says_free_unasked_is_asked_before_it_is_told_ag
 
 
 @jumping
+async def test_a_busy_robot_is_no_less_busy_where_the_poll_cannot_leave() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    robots.script = lambda _: [(0.1, b"B")]
+    call = asyncio.ensure_future(robots.hexa("garra", 10, timeout_s=2))
+    await asyncio.sleep(0.05)
+    robots.stuck = True
+    for _ in range(4):
+        await asyncio.sleep(0.5)
+        robots.expire("arm")
+    assert (await refused(call)).code == "busy"
+
+
+@jumping
+async def test_a_robot_that_says_free_while_the_poll_waits_is_asked_all_the_same() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    scripts = iter([[(0.1, b"B")], [(0.1, b"F")], [(0.1, b"A")]])
+    robots.script = lambda _: next(scripts)
+    call = asyncio.ensure_future(robots.hexa("garra", 90))
+    await asyncio.sleep(0.2)
+    robots.stuck = True
+    await asyncio.sleep(0.6)
+    robots.says(b"F")
+    await asyncio.sleep(0.1)
+    robots.flows()
+    assert (await call).status == "sucesso"
+    assert robots.payloads == [b"\x04\x7f", b"?", b"\x04\x7f"]
+
+
+@jumping
 async def test_a_busy_robot_that_does_not_know_avail_is_busy() -> None:
     robots = Robots(busy_poll_s=0.5)
     robots.script = lambda frame: [(0.1, b"W" if frame.payload == b"?" else b"B")]
@@ -266,6 +328,23 @@ async def test_a_link_that_goes_down_ends_its_calls_and_no_others() -> None:
     assert not kept.done()
     robots.say(psiu_hexa.packet(ARM, OURS, b"A"))
     assert (await kept).status == "sucesso"
+
+
+@jumping
+async def test_a_far_end_that_goes_away_ends_its_calls_and_no_others() -> None:
+    robots = Robots()
+    beta, here, there = Address.named("BETA"), ("127.0.0.1", 9001), ("127.0.0.1", 9002)
+    lost = asyncio.ensure_future(robots.ascii("parafrente", 100, link="wifi", peer=here))
+    kept = asyncio.ensure_future(robots.ascii("parafrente", 100, address=beta, link="wifi", peer=there))
+    other = asyncio.ensure_future(robots.hexa("garra", 1))
+    await asyncio.sleep(0.1)
+    robots.conversations.link_down("wifi", "gone", here)
+    error = await refused(lost)
+    assert error.code == "link_down"
+    assert str(error).startswith("link wifi to 127.0.0.1:9001 is down since ")
+    assert robots.says(b"parafrente sucesso", beta)
+    assert robots.says(b"A")
+    assert {(await kept).status, (await other).status} == {"sucesso"}
 
 
 @jumping

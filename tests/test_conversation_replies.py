@@ -50,7 +50,7 @@ async def test_a_stop_waits_neither_for_other_stops_nor_for_late_answers() -> No
         assert robots.says(b"pare sucesso", MNERIM)
         await asyncio.sleep(0.01)
         done.append((second.done(), third.done()))
-    assert done == [(False, False), (True, False), (True, True)]
+    assert done == [(True, False), (True, True), (True, True)]
     assert {(await second).status, (await third).status} == {"sucesso"}
 
 
@@ -62,6 +62,14 @@ async def test_two_stops_answered_in_one_breath_are_both_answered() -> None:
     assert robots.says(b"pare sucesso", MNERIM)
     assert robots.says(b"pare falha", MNERIM)
     assert [(await call).status for call in calls] == ["sucesso", "falha"]
+
+
+@jumping
+async def test_a_stop_that_the_robot_confirms_is_confirmed_whatever_became_of_those_before() -> None:
+    robots = Robots()
+    await robots.conversations.tell(robots.of_words(), "pare", [], fresh_s=2)  # the robot does not hear it
+    robots.script = lambda _: [(0.1, b"pare sucesso")]
+    assert (await robots.ascii("pare")).status == "sucesso"
 
 
 # Late replies.
@@ -181,6 +189,112 @@ async def test_a_busy_robots_late_word_about_itself_does_not_move_it_twice() -> 
     robots.script = lambda _: [(0.6, b"A")]
     assert (await robots.hexa("garra", 20)).status == "sucesso"
     assert [payload for payload in robots.payloads if payload != b"?"] == [b"\x04\x0e", b"\x04\x1c"]
+
+
+@jumping
+async def test_what_waits_in_an_outbox_is_answered_by_nothing_that_is_heard() -> None:
+    robots = Robots()
+    robots.stuck = True
+    call = asyncio.ensure_future(robots.hexa("garra", 10))
+    await asyncio.sleep(0.1)
+    assert not robots.says(b"A")
+    robots.flows()
+    await asyncio.sleep(0.1)
+    assert not call.done()
+    assert robots.says(b"A")
+    assert (await call).status == "sucesso"
+
+
+@jumping
+async def test_the_answer_to_a_command_that_left_late_is_not_the_next_ones() -> None:
+    robots = Robots()
+    robots.stuck = True
+    first = asyncio.ensure_future(robots.hexa("garra", 10, timeout_s=2))
+    await asyncio.sleep(1.9)
+    robots.flows()
+    assert (await refused(first)).code == "outcome_unknown"
+    second = asyncio.ensure_future(robots.hexa("garra", 20))
+    await asyncio.sleep(1)
+    assert robots.says(b"A")
+    await asyncio.sleep(0.1)
+    assert not second.done()
+    assert robots.sent[1:] == [(3.0, b"\x04\x1c")]
+    assert robots.says(b"A")
+    await second
+
+
+@jumping
+async def test_the_answer_to_a_put_that_left_late_is_not_the_next_calls() -> None:
+    robots = Robots()
+    robots.stuck = True
+    await robots.conversations.tell(robots.of_bytes(), "garra", [10], fresh_s=2)
+    await asyncio.sleep(1)
+    assert not robots.says(b"A")  # whatever it is about
+    call = asyncio.ensure_future(robots.hexa("garra", 20, timeout_s=10))
+    await asyncio.sleep(0.9)
+    robots.flows()
+    await asyncio.sleep(0.3)
+    assert robots.says(b"A")
+    await asyncio.sleep(0.1)
+    assert robots.sent == [(1.9, b"\x04\x0e"), (2.2, b"\x04\x1c")]
+    assert not call.done()
+    assert robots.says(b"A")
+    await call
+
+
+@jumping
+async def test_a_put_that_left_late_and_is_never_answered_is_waited_for_from_then_on() -> None:
+    robots = Robots()
+    robots.stuck = True
+    await robots.conversations.tell(robots.of_bytes(), "garra", [10], fresh_s=2)
+    call = asyncio.ensure_future(robots.hexa("garra", 20, timeout_s=10))
+    await asyncio.sleep(0.5)
+    robots.flows()
+    robots.script = lambda _: [(0.1, b"A")]
+    await call
+    assert robots.sent[1:] == [(2.5, b"\x04\x1c")]
+
+
+@jumping
+async def test_of_two_puts_alike_it_is_the_dropped_one_that_is_not_owed_for() -> None:
+    robots = Robots()
+    await robots.conversations.tell(robots.of_bytes(), "garra", [10], fresh_s=2)
+    robots.stuck = True
+    await robots.conversations.tell(robots.of_bytes(), "garra", [10], fresh_s=2)
+    robots.conversations.undelivered(robots._kept.pop()[1], CallError("expired", "too late"))
+    assert robots.says(b"A")
+    assert not robots.says(b"A")
+
+
+@jumping
+async def test_polls_that_never_left_are_not_owed_for() -> None:
+    robots = Robots(busy_poll_s=0.1)
+    robots.script = lambda frame: [(0.01, b"F" if frame.payload == b"?" else b"BA"[len(robots.sent) > 1 :][:1])]
+    call = asyncio.ensure_future(robots.hexa("garra", 10, timeout_s=8))
+    await asyncio.sleep(0.05)
+    robots.stuck = True
+    for _ in range(5):  # the clock of the links
+        await asyncio.sleep(0.1)
+        robots.expire("arm")
+    robots.stuck = False
+    assert (await call).status == "sucesso"
+    robots.expire("arm")
+    begun = now()
+    await robots.hexa("garra", 20)
+    assert robots.sent[-1][0] == pytest.approx(begun - robots.begun)
+
+
+@jumping
+async def test_a_word_too_many_from_the_robot_pays_for_nothing_that_it_owes() -> None:
+    robots = Robots(busy_poll_s=0.5)
+    robots.script = lambda frame: [] if frame.payload == b"?" else [(0.1, b"B"), (0.2, b"F")]
+    assert (await refused(robots.hexa("garra", 10, timeout_s=0.8))).code == "busy"
+    robots.script = lambda _: [(0.1, b"A")]
+    second = asyncio.ensure_future(robots.hexa("garra", 20))
+    await asyncio.sleep(0.5)
+    assert robots.says(b"F")
+    await second
+    assert robots.sent[-1] == (1.3, b"\x04\x1c")
 
 
 # Commands without waiting.
@@ -407,6 +521,44 @@ async def test_a_complaint_that_may_be_of_anothers_frame_does_not_move_the_robot
     robots.conversations.complained("radio")
     assert (await refused(task)).code == "outcome_unknown"
     assert robots.payloads == [b"parafrente 50"]
+
+
+@jumping
+async def test_a_complaint_long_after_ours_is_not_of_ours() -> None:
+    robots = Robots()
+    task = asyncio.ensure_future(robots.ascii("parafrente", 50))
+    await asyncio.sleep(0.6)
+    robots.conversations.complained("radio")
+    assert (await refused(task)).code == "outcome_unknown"
+    assert robots.payloads == [b"parafrente 50"]
+
+
+@pytest.mark.parametrize("after_s", [-0.3, 0.01])
+@jumping
+async def test_a_complaint_that_may_be_of_a_frame_that_was_heard_does_not_move_the_robot_twice(after_s: float) -> None:
+    robots = Robots()
+    if after_s < 0:
+        robots.another_is_heard("radio")
+        await asyncio.sleep(-after_s)
+    task = asyncio.ensure_future(robots.ascii("parafrente", 50))
+    await asyncio.sleep(0.02)
+    if after_s > 0:
+        robots.another_is_heard("radio")
+    robots.conversations.complained("radio")
+    assert (await refused(task)).code == "outcome_unknown"
+    assert robots.payloads == [b"parafrente 50"]
+
+
+@jumping
+async def test_a_question_that_waits_to_leave_is_not_sent_twice_on_a_complaint() -> None:
+    robots = Robots()
+    robots.stuck = True
+    task = asyncio.ensure_future(robots.ascii("exibecomando", 1))
+    await asyncio.sleep(0.1)
+    robots.conversations.complained("radio")
+    await asyncio.sleep(0.1)
+    assert len(robots._kept) == 1
+    task.cancel()
 
 
 @jumping

@@ -32,6 +32,7 @@ class Resident:
         self._exchange = exchange
         self.answered: list[Frame] = []
         self.translated: list[Frame] = []
+        self.delivered_frames: list[Frame] = []
         self.undelivered_frames: list[tuple[Frame, Verdict]] = []
 
     def answer(self, frame: Frame, way: Way, now: float) -> None:
@@ -45,11 +46,15 @@ class Resident:
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None: ...
     def asked_names(self, ways: Iterable[Way], now: float) -> None: ...
+    def delivered(self, frame: Frame, now: float) -> None:
+        self.delivered_frames.append(frame)
+
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self.undelivered_frames.append((frame, verdict))
 
     def link_opened(self, link: Link, now: float) -> None: ...
     def link_closed(self, link: Link, now: float) -> None: ...
+    def peer_lost(self, way: Way, now: float) -> None: ...
 
 
 class Bus:
@@ -280,6 +285,27 @@ def test_a_callers_patience_holds_on_every_way_to_a_robot_that_is_sought(world: 
     world.links["wifi"].writable()
     assert world.wires("wifi") == []
     assert world.resident.undelivered_frames == [(command, "expired")]
+
+
+def test_the_resident_is_told_when_its_frame_leaves_and_no_sooner(world: World) -> None:
+    world.exchange.router.table.learn(ROBOTS[1], Way("radio"), "psiu-ascii", world.now)
+    first, second = (psiu_ascii.message(BASE, ROBOTS[1], "parafrente", distance) for distance in "12")
+    world.exchange.send(first, world.now)
+    assert world.resident.delivered_frames == [first]
+    world.transports["radio"].full = True
+    world.exchange.send(second, world.now)
+    assert world.resident.delivered_frames == [first]
+    world.transports["radio"].full = False
+    world.links["radio"].writable()
+    assert world.resident.delivered_frames == [first, second]
+
+
+def test_a_frame_has_left_with_its_first_copy(world: World) -> None:
+    world.exchange.router.table.learn(ROBOTS[1], Way("wifi"), "psiu-ascii", world.now)
+    world.transports["wifi"].full_peers = {PEERS[1]}
+    command = psiu_ascii.message(BASE, ROBOTS[1], "parafrente", "1")
+    assert world.exchange.send(command, world.now) is None
+    assert world.resident.delivered_frames == [command]
 
 
 def test_an_answer_goes_to_who_was_heard_by_the_robot_not_to_who_only_tried() -> None:

@@ -376,17 +376,42 @@ async def test_a_call_to_stop_passes_the_call_under_way(labs: Labs) -> None:
     motion.cancel()
 
 
-@pytest.mark.parametrize("foreign", [True, False])
-async def test_a_motion_is_sent_again_only_on_a_complaint_of_its_own(labs: Labs, foreign: bool) -> None:
+@pytest.mark.parametrize("foreign", ["relayed", "heard", None])
+async def test_a_motion_is_sent_again_only_on_a_complaint_of_its_own(labs: Labs, foreign: str | None) -> None:
     lab = labs(words(), words("wifi", MemoryDatagrams(ends=(1,))))
     lab.know()
+    lab.links["radio"].last_heard = None  # long ago
     motion = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 50, timeout_s=0.3))
     await settled()
-    if foreign:
+    if foreign == "relayed":
         lab.hears("wifi", wire("PC", "MNERIM", "distancia"), 1)
+    elif foreign == "heard":
+        lab.hears("radio", wire("BETA", "GAMA", "giradireita", "90"))
     lab.hears("radio", b"CHECKSUM NAO BATEU!\r\n")
     assert await refused(motion) == "outcome_unknown"
     assert said(lab.far["radio"]).count("MNERIM parafrente 50 base") == (1 if foreign else 2)
+
+
+async def test_the_answer_to_a_command_that_left_late_is_not_the_next_ones(labs: Labs) -> None:
+    lab = labs(arm(timeout_s=0.3))
+    lab.far["arm"].full = True
+    first = asyncio.ensure_future(lab.call("BRACO", "garra", 45, timeout_s=0.05))
+    await settled()
+    lab.hears("arm", arm_says(b"A"))
+    await settled()
+    assert not first.done()
+    lab.far["arm"].full = False
+    lab.links["arm"].writable()
+    assert await refused(first) == "outcome_unknown"
+    second = asyncio.ensure_future(lab.call("BRACO", "garra", -90))
+    await settled()
+    assert len(lab.far["arm"].wires) == 1
+    lab.hears("arm", arm_says(b"A"))
+    await settled()
+    assert len(lab.far["arm"].wires) == 2
+    assert not second.done()
+    lab.hears("arm", arm_says(b"A"))
+    assert (await second).status == "sucesso"
 
 
 async def test_a_command_that_never_left_is_said_to_have_expired(labs: Labs) -> None:
@@ -409,6 +434,23 @@ async def test_an_outbox_that_reads_its_clock_a_moment_later_still_tells_what_ne
     moment += 0.0999
     calling.expire("radio")
     assert lab.links["radio"].outbox.size == 0
+
+
+async def test_a_link_or_a_far_end_that_goes_away_ends_the_calls_there_at_once(labs: Labs) -> None:
+    lab = labs(words(), words("wifi", MemoryDatagrams(ends=(("127.0.0.1", 9001), ("127.0.0.1", 9002)))))
+    beta = Address.named("BETA")
+    lab.know()
+    lab.hears("wifi", wire("BETA", "base", "parafrente", "sucesso"), ("127.0.0.1", 9001))
+    for end, robot in (
+        (lambda: lab.links["radio"].lost(LinkLost("unplugged")), MNERIM),
+        (lambda: lab.links["wifi"].peer_lost(("127.0.0.1", 9001)), beta),
+    ):
+        call = asyncio.ensure_future(lab.call(str(robot), "parafrente", 50))
+        await settled()
+        end()
+        await settled()
+        assert call.done()
+        assert await refused(call) == "link_down"
 
 
 async def test_a_put_does_not_end_a_call_and_its_answer_is_not_refused(labs: Labs) -> None:

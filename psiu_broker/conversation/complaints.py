@@ -7,22 +7,29 @@ COMPLAINT_WITHIN_S: Final = 0.5
 
 
 class Traffic(NamedTuple):
-    """How many frames have left on a link so far, and when the last one did."""
+    """How many frames have left on a link so far, how many were heard, and when the last of all these passed."""
 
     frames: int
     last_at: float
+    heard: int = 0
+    """None where each far end is told apart: what another one was told is not what this one complains of."""
 
 
 class Sending(NamedTuple):
     """A frame of ours among the others on its link."""
 
     link: str
-    frames: int
-    """How many had left, this one included."""
-    at_once: bool
-    """It did not have to wait, so that the last of `frames` is this one."""
+    traffic: Traffic
+    """What had passed, this one included."""
+    alone: bool
+    """It is the last of `traffic`."""
     others_at: float
-    """When the last frame before it left of which nobody knows how it fared."""
+    """When the last frame before it passed of which nobody knows how it fared."""
+
+    def is_last(self, traffic: Traffic, replies: int = 0) -> bool:
+        """Whether nothing has passed since but `replies`, where these are counted at all."""
+        since = traffic.heard - self.traffic.heard
+        return self.alone and traffic.frames == self.traffic.frames and since <= replies
 
 
 class Complaints:
@@ -34,15 +41,16 @@ class Complaints:
     def sending(self, link: str, before: Traffic, after: Traffic) -> Sending:
         """Take note of a frame that was sent between `before` and `after`."""
         settled = self._settled.get(link)
-        others_at = settled.last_at if settled is not None and settled.frames == before.frames else before.last_at
-        return Sending(link, after.frames, after.frames == before.frames + 1, others_at)
+        known = settled is not None and (settled.frames, settled.heard) == (before.frames, before.heard)
+        others_at = settled.last_at if settled is not None and known else before.last_at
+        return Sending(link, after, after.frames == before.frames + 1, others_at)
 
-    def settle(self, sending: Sending, traffic: Traffic) -> None:
-        """The robot has said how it fared with that frame: no later complaint is about it."""
-        if sending.at_once and traffic.frames == sending.frames:
-            self._settled[sending.link] = Traffic(sending.frames, sending.others_at)
+    def settle(self, sending: Sending, traffic: Traffic, replies: int = 0) -> None:
+        """The robot has said how it fared with that frame, in `replies`: no later complaint is about it."""
+        if sending.is_last(traffic, replies):
+            self._settled[sending.link] = traffic._replace(last_at=sending.others_at)
 
     def blame(self, sending: Sending, traffic: Traffic, now: float) -> bool:
-        """Whether a complaint at `now` can be about no other frame: none left since, and none shortly before."""
-        alone = sending.at_once and traffic.frames == sending.frames
-        return alone and now - sending.others_at >= COMPLAINT_WITHIN_S
+        """Whether a complaint at `now` can be about no other frame: none passed since, and none shortly before."""
+        soon = now - sending.traffic.last_at <= COMPLAINT_WITHIN_S
+        return soon and sending.is_last(traffic) and now - sending.others_at >= COMPLAINT_WITHIN_S

@@ -2,18 +2,19 @@
 
 A call goes through these states, and every wait ends at its deadline:
 
-    turn ──> quiet ──> sent ──reply──────────────> Answer
-                        │ ├──AGAIN──> settled ──> sent (bounded by `retries`)
-                        │ ├──BUSY───> AVAIL? every `busy_poll_s` ──FREE──> sent
-                        │ └──silence> sent again if it is a question, else outcome_unknown
-                        └──not possible, link down, shutting down: CallError
+    turn ──> quiet ──> offered ──> sent ──reply──────────────> Answer
+                        │           │ ├──AGAIN──> settled ──> offered (bounded by `retries`)
+                        │           │ ├──BUSY───> AVAIL? every `busy_poll_s` ──FREE──> offered
+                        │           │ └──silence> offered again if it is a question, else outcome_unknown
+                        └───────────┴──dropped, not possible, link down, shutting down: CallError
 
+Offered: it may wait in the outbox of its link, and nothing that is heard can be about it.
 Quiet: the robot owes no late reply that could be mistaken for the answer. A stop waits for neither turn nor quiet.
 All methods run on the event loop's thread; times are seconds of the loop's clock.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
 from math import inf
@@ -22,9 +23,9 @@ from typing import Protocol
 from psiu_broker.conversation.complaints import Complaints, Traffic
 from psiu_broker.conversation.late_replies import LateReplies
 from psiu_broker.conversation.turns import Turns
-from psiu_broker.conversation.under_way import Robot, UnderWay
+from psiu_broker.conversation.under_way import Offer, Robot, UnderWay
 from psiu_broker.errors import CallError, EncodeError
-from psiu_broker.frame import Address, Frame
+from psiu_broker.frame import Address, Frame, peer_text
 from psiu_broker.messages import Answer, Value
 from psiu_broker.profiles.profile import Notice, Reading, Reply, Request
 
@@ -35,7 +36,8 @@ class Links(Protocol):
     def send(self, frame: Frame, patience_s: float) -> CallError | None:
         """Offer a frame to its link, where it may wait for `patience_s`; None, or why it cannot go.
 
-        What is dropped there after all is told to `Conversations.undelivered`.
+        When it leaves, at once or later, is told to `Conversations.delivered`; that it is dropped after all to
+        `Conversations.undelivered`.
         """
 
     def expire(self, link: str) -> None:
@@ -113,21 +115,27 @@ class Conversations:
         if not self._under_way and not self._late:
             return False
         calls = self._under_way.get(frame.source, ())
-        if self._late.take(frame, now):
+        about = _about(calls, frame)
+        # An earlier stop that was put may owe this very answer, or be lost; who waits is told that the robot stops.
+        stops = about is not None and about[0].is_stop and not about[0].has_reply
+        if not stops and self._late.take(frame, now):
             for call in calls:
                 call.woken.set()
             return True
-        about: tuple[UnderWay, Reading] | None = None
-        for call in calls:
-            if not call.sent or frame.destination != call.robot.own:
-                continue
-            reading = call.robot.profile.read(call.request, frame)
-            if reading is not None and (about is None or about[0].has_reply):
-                about = call, reading
         if about is None:
             return False
-        about[0].answer(about[1], now)
+        call, reading = about
+        call.answer(reading, now)
+        if call.sending is not None:
+            self._complaints.settle(call.sending, self._links.traffic(call.robot.link), replies=1)
         return True
+
+    def delivered(self, frame: Frame, now: float) -> None:
+        """A frame that `Links.send` took has left: what is heard from now on can be the answer to it."""
+        self._late.delivered(frame, now)
+        for call in self._under_way.get(frame.destination, ()):
+            call.woken.set()
+            call.delivered(frame, now)
 
     def complained(self, link: str, peer: object = None) -> None:
         """Somebody there said in plain text that it did not understand, without saying who it is or what it was.
@@ -138,10 +146,11 @@ class Conversations:
         traffic = self._links.traffic(link)
         for call in [call for calls in self._under_way.values() for call in calls]:
             robot = call.robot
-            if call.sending is None or robot.link != link or (robot.peer is not None and robot.peer != peer):
+            if not call.sent or call.waiting or robot.link != link or (robot.peer is not None and robot.peer != peer):
                 continue
-            if self._complaints.blame(call.sending, traffic, now):
+            if call.sending is not None and self._complaints.blame(call.sending, traffic, now):
                 call.answer(Notice.AGAIN, now)
+                self._complaints.settle(call.sending, traffic)
             elif call.request.question or call.is_stop:
                 call.hear(Notice.AGAIN, now)
 
@@ -150,18 +159,19 @@ class Conversations:
         self._late.undelivered(frame)
         for call in self._under_way.get(frame.destination, ()):
             call.woken.set()
-            if call.frame is frame:
-                call.sent -= 1
+            offer = call.taken(frame)
+            if offer is not None and offer.needed:
                 call.hear(error, 0.0)
 
-    def link_down(self, link: str, reason: str) -> None:
-        """End the calls under way on `link`."""
+    def link_down(self, link: str, reason: str, peer: object = None) -> None:
+        """End the calls under way on `link`, or those to `peer` there."""
         since = datetime.now(UTC).strftime("%H:%M:%S UTC")
+        down = f"link {link}" if peer is None else f"link {link} to {peer_text(peer)}"
         for call in [call for calls in self._under_way.values() for call in calls]:
-            if call.robot.link == link:
+            if call.robot.link == link and (peer is None or call.robot.peer == peer):
                 unknown = call.sent and not call.request.question
                 doubt = "; whether it was done is unknown" if unknown else ""
-                text = f"link {link} is down since {since} ({reason}), before {call.robot.name} answered{doubt}"
+                text = f"{down} is down since {since} ({reason}), before {call.robot.name} answered{doubt}"
                 call.hear(CallError("link_down", text), 0.0)
 
     def pinging(self, address: Address) -> bool:
@@ -202,10 +212,12 @@ class Conversations:
             self._under_way[address].remove(call)
             if not self._under_way[address]:
                 del self._under_way[address]
+            now, profile, request = asyncio.get_running_loop().time(), call.robot.profile, call.request
             if call.frame is not None:
-                now, until = asyncio.get_running_loop().time(), call.sent_at + call.request.timeout_s
                 missing = call.sent - call.answered
-                self._late.expect(call.frame, call.robot.profile, call.request, missing, now, until)
+                self._late.expect(call.frame, profile, request, missing, now, call.sent_at + request.timeout_s)
+            for offer in call.waiting:
+                self._late.expect_waiting(offer.frame, profile, request, now, offer.until)
 
     async def _quiet(self, call: UnderWay) -> None:
         """Wait until the robot owes nothing that could be mistaken for the answer, unless it is a stop."""
@@ -242,13 +254,13 @@ class Conversations:
                 raise _no_answer(call, tries, understood=reading is None)
 
     async def _after_sending(self, call: UnderWay, until: float) -> tuple[Reading | None, float]:
-        """What came of one try: a reply, None for silence, AGAIN once the robot is quiet, FREE after it was busy."""
+        """What came of one try: a reply, None for silence, AGAIN once the robot is quiet, FREE after it was busy.
+
+        The frame may leave up to `until`; the robot has as long as it may take from then on.
+        """
+        await self._left(call, until)
+        until = min(max(call.sent_at + call.patience_s, until), call.deadline)
         reading, at = await self._next_but(call, until, Notice.FREE)
-        if reading is None:
-            self._links.expire(call.robot.link)
-            reading, at = await self._next_but(call, at, Notice.FREE)
-        if reading is not None and call.sending is not None:
-            self._complaints.settle(call.sending, self._links.traffic(call.robot.link))
         if reading is Notice.AGAIN:
             settled = min(asyncio.get_running_loop().time() + self._settle_s, call.deadline)
             reading, at = await self._next_but(call, settled, Notice.FREE, Notice.AGAIN)
@@ -256,6 +268,14 @@ class Conversations:
         if reading is Notice.BUSY:
             reading, at = await self._until_free(call)
         return reading, at
+
+    async def _left(self, call: UnderWay, until: float) -> None:
+        """Wait until nothing of the call waits in an outbox any more, or something is heard, at most until `until`."""
+        loop = asyncio.get_running_loop()
+        while call.waiting and not call.heard and loop.time() < until:
+            await call.rest(until)
+        if call.waiting and not call.heard:
+            self._links.expire(call.robot.link)
 
     async def _next_but(self, call: UnderWay, until: float, *ignored: Notice) -> tuple[Reading | None, float]:
         while True:
@@ -272,15 +292,15 @@ class Conversations:
         loop = asyncio.get_running_loop()
         poll = call.robot.profile.poll
         next_poll = loop.time() + call.busy_poll_s
-        asked = False
+        sent = call.sent
         while poll is not None and loop.time() < call.deadline:
             if loop.time() >= next_poll:
                 next_poll = loop.time() + call.busy_poll_s
                 self._offer(call, poll, min(next_poll, call.deadline))
-                asked = True
             reading, at = await call.next(min(next_poll, call.deadline))
             if isinstance(reading, Reply):
                 return reading, at
+            asked = call.sent > sent
             if reading is Notice.FREE and asked and loop.time() < call.deadline:
                 return reading, at
             if reading is Notice.IMPOSSIBLE and asked:
@@ -301,16 +321,30 @@ class Conversations:
         except EncodeError as error:
             raise CallError("refused", f"{call.command} cannot be sent to {robot.name}: {error}") from error
         before = self._links.traffic(robot.link)
-        call.frame, call.sent_at, call.sent = frame, now, call.sent + 1
+        call.sending = None
+        call.waiting.append(Offer(frame, until, needed=request is call.request))
         refused = self._links.send(frame, until - now)
         if refused is not None:
-            call.sent -= 1
+            call.taken(frame)
             raise refused
-        call.sending = self._complaints.sending(robot.link, before, self._links.traffic(robot.link))
+        if not call.waiting:
+            call.sending = self._complaints.sending(robot.link, before, self._links.traffic(robot.link))
 
     def _refuse_when_closed(self) -> None:
         if self._closed:
             raise _shutting_down()
+
+
+def _about(calls: Iterable[UnderWay], frame: Frame) -> tuple[UnderWay, Reading] | None:
+    """The call that `frame` is about, rather one that has no reply yet, and what it says."""
+    about: tuple[UnderWay, Reading] | None = None
+    for call in calls:
+        if not call.sent or frame.destination != call.robot.own:
+            continue
+        reading = call.robot.profile.read(call.request, frame)
+        if reading is not None and (about is None or about[0].has_reply):
+            about = call, reading
+    return about
 
 
 def _under_way(robot: Robot, command: str, request: Request, timeout_s: float, fresh_s: float) -> UnderWay:

@@ -1,5 +1,7 @@
 """Replies that robots still owe: to calls that have ended, to tries before the last, and to what was only told.
 
+Of a frame that still waits in an outbox a reply will be owed, and none can be to it yet.
+
 PSIU numbers no message, so that a late reply would read as the answer to the next request like it.
 """
 
@@ -18,6 +20,7 @@ class _Owed(NamedTuple):
     until: float
     profile: Profile
     request: Request
+    left: bool
 
 
 class LateReplies:
@@ -30,15 +33,29 @@ class LateReplies:
         return bool(self._owed)
 
     def expect(self, frame: Frame, profile: Profile, request: Request, count: int, now: float, until: float) -> None:
-        """`count` replies to `frame`, which was sent for `request`, may come up to `until`."""
-        robot = frame.destination
+        """`count` replies to `frame`, which has left for `request`, may come up to `until`."""
+        self._owe(_Owed(frame, until, profile, request, left=True), count, now)
+
+    def expect_waiting(self, frame: Frame, profile: Profile, request: Request, now: float, leaves_by: float) -> None:
+        """`frame` for `request` waits in an outbox: until `delivered` or `undelivered` nobody knows what is owed."""
+        self._owe(_Owed(frame, leaves_by + request.timeout_s, profile, request, left=False), 1, now)
+
+    def delivered(self, frame: Frame, now: float) -> None:
+        """`frame` has left, if it is one that waited."""
+        owed = self._owed.get(frame.destination, [])
+        for place, each in enumerate(owed):
+            if each.frame is frame and not each.left:
+                owed[place] = each._replace(until=now + each.request.timeout_s, left=True)
+
+    def _owe(self, debt: _Owed, count: int, now: float) -> None:
+        robot = debt.frame.destination
         if robot not in self._owed:
             for other in list(self._owed):
                 self._prune(other, now)
         self._prune(robot, now)
-        if count > 0 and until > now:
+        if count > 0 and debt.until > now:
             owed = self._owed.setdefault(robot, [])
-            owed += [_Owed(frame, until, profile, request)] * count
+            owed += [debt] * count
             del owed[:-OWED_KEPT]
 
     def take(self, frame: Frame, now: float) -> bool:
@@ -46,7 +63,8 @@ class LateReplies:
         if frame.source not in self._owed:
             return False
         for owed in self._prune(frame.source, now):
-            if owed.frame.source == frame.destination and owed.profile.read(owed.request, frame) is not None:
+            ours = owed.left and owed.frame.source == frame.destination
+            if ours and owed.profile.read(owed.request, frame) is not None:
                 self._forget(owed)
                 return True
         return False

@@ -4,7 +4,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from psiu_broker.conversation.complaints import Sending
 from psiu_broker.errors import CallError
@@ -28,6 +28,16 @@ class Robot:
     peer: object = None
 
 
+class Offer(NamedTuple):
+    """A frame that its link has taken and that may wait there."""
+
+    frame: Frame
+    until: float
+    """When it is dropped."""
+    needed: bool
+    """The call is over if it is dropped: it is no poll."""
+
+
 @dataclass(slots=True, eq=False)
 class UnderWay:
     """A call, from when it waits for its turn."""
@@ -42,11 +52,14 @@ class UnderWay:
     patience_s: float = 0.0
     retries: int = 0
     busy_poll_s: float = 0.0
+    waiting: list[Offer] = field(default_factory=list)
     sent: int = 0
-    answered: int = 0
-    sent_at: float = 0.0
+    """How many frames have left, the last of them, and when it did."""
     frame: Frame | None = None
+    sent_at: float = 0.0
+    answered: int = 0
     sending: Sending | None = None
+    """The last frame among the others on its link; None where it had to wait."""
     heard: deque[tuple[Reading | CallError, float]] = field(default_factory=deque)
     woken: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -57,6 +70,19 @@ class UnderWay:
     @property
     def has_reply(self) -> bool:
         return any(isinstance(reading, Reply) for reading, _ in self.heard)
+
+    def taken(self, frame: Frame) -> Offer | None:
+        """What `frame`, itself and not one like it, was offered as, which waits no more; None if it did not wait."""
+        offer = next((each for each in self.waiting if each.frame is frame), None)
+        if offer is not None:
+            self.waiting = [each for each in self.waiting if each is not offer]
+        return offer
+
+    def delivered(self, frame: Frame, now: float) -> None:
+        """Take note that `frame` has left, if it is one of these."""
+        if self.taken(frame) is not None:
+            self.frame, self.sent_at, self.sent = frame, now, self.sent + 1
+            self.woken.set()
 
     def answer(self, reading: Reading, now: float) -> None:
         """Hear what can only be about a frame of this call."""
