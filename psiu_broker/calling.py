@@ -249,6 +249,8 @@ class Calling:
         if departed is None:
             raise CallError("unknown_robot", f"no robot {robot} is known, and none answered to that name")
         ago_s = self._clock() - departed.at
+        if departed.link == MESH:
+            raise CallError("unknown_robot", f"{robot} was with another broker until {ago_s:.0f} s ago")
         link = self._exchange.links[departed.link]
         if link.state == "open":
             raise CallError(

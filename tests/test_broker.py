@@ -16,7 +16,7 @@ from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session
 from psiu_broker.config import load
 from psiu_broker.errors import BusError, CallError
-from psiu_broker.frame import Address
+from psiu_broker.frame import MESH, Address, Way
 from psiu_broker.messages import Answer, CallRequest, Card
 from psiu_broker.routing.table import Route
 from psiu_broker.simulator import AsciiRobot, Extra, HexaRobot, PtyPort, UdpPort
@@ -264,6 +264,15 @@ async def test_a_motion_is_never_repeated_on_silence(lab: Lab) -> None:
     assert silent.value.code == "no_answer"
     assert b"".join(arrived).count(b"parafrente") == 1
     assert b"".join(arrived).count(b"quantoscomandos") == 3
+
+
+async def test_a_robot_that_went_with_its_broker_is_unknown(lab: Lab) -> None:
+    north, router = Way(MESH, "north"), lab.broker.exchange.router
+    router.announced((Address.named("FAR"),), north, "psiu-ascii", time.monotonic())
+    router.peer_lost(north, time.monotonic())
+    with pytest.raises(CallError, match="FAR was with another broker") as unknown:
+        await lab.call("FAR", "qualseunome", timeout_s=0.2)
+    assert unknown.value.code == "unknown_robot"
 
 
 async def test_why_tells_the_decision_and_its_reasons(lab: Lab) -> None:

@@ -163,7 +163,8 @@ def _facts(hop: Why) -> str:
     facts = [
         None if hop.age_s is None else f"{hop.b} was heard {ago(hop.age_s)}",
         None if hop.cost_ms is None else f"takes about {milliseconds(hop.cost_ms)} on {hop.link or 'the way'}",
-        hop.filter,
+        # What stopped it is often a step already.
+        None if hop.filter is None or any(hop.filter in step for step in hop.steps) else hop.filter,
     ]
     return "; ".join(fact for fact in facts if fact is not None)
 

@@ -120,6 +120,11 @@ def test_one_broker_tells_its_steps_alone(bus: Bus, tool: Run) -> None:
     assert tool("why", "A", "B").stdout == "A → B would not arrive: no_route\n  a step of base\n"
 
 
+def test_a_filter_that_is_a_step_already_is_not_said_twice(bus: Bus, tool: Run) -> None:
+    bus.answers = answers(why("base", delivered=False, verdict="no_route", steps=["dropped: nobody"], filter="nobody"))
+    assert tool("why", "A", "B").stdout.splitlines()[1:] == ["  dropped: nobody"]
+
+
 def test_json_has_the_hops_in_their_order(bus: Bus, tool: Run) -> None:
     bus.answers = answers(THERE, HERE)
     assert [Why.model_validate(each) for each in json.loads(tool("why", "A", "B", "--json").stdout)] == [HERE, THERE]
