@@ -174,6 +174,18 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         lab.close()
 
 
+@pytest.fixture(scope="session")
+def process() -> type[Process]:
+    """For those that end their processes themselves."""
+    return Process
+
+
+@pytest.fixture(scope="session")
+def port() -> Callable[[socket.SocketKind], int]:
+    """A free port of a kind."""
+    return free_port
+
+
 @pytest.fixture
 def start() -> Iterator[Callable[..., Process]]:
     """Start console scripts that end with the test."""
