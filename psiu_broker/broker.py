@@ -147,6 +147,7 @@ class Broker:
         await asyncio.gather(*self._link_tasks, *self._tasks, return_exceptions=True)
         if self._bus is not None:
             self.exchange.bus = NoBus()
+            self._bus.publisher.withdraw_cards()
             await self._bus.session.close()
         self._trunks.close()
 

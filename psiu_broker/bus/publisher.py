@@ -133,6 +133,11 @@ class Publisher:
         if self._cards.pop(robot, None) is not None:
             self.delete_card(robot)
 
+    def withdraw_cards(self) -> None:
+        """The broker leaves, and its robots with it."""
+        for robot in tuple(self._cards):
+            self.withdraw_card(robot)
+
     def delete_card(self, robot: Address) -> None:
         """Delete the card of a robot that is gone."""
         try:

@@ -156,7 +156,8 @@ class Mesh:
         """Brokers that went, by name and life: if they were only out of sight, the series go on."""
         self._tokens: dict[str, Tokens] = {}
         self._given: dict[Address, float] = {}
-        self._orphans: dict[Address, float] = {}
+        self._orphans: dict[Address, tuple[str, float]] = {}
+        """Robots that nobody owns any more: who did last, and until when."""
         self._strangers: dict[str, float] = {}
         self._beaten = -inf
         self._anew_at = -inf
@@ -251,7 +252,7 @@ class Mesh:
         self._tokens.pop(name, None)
         self._router.peer_lost(neighbour.way, now)
         for robot in self.claims.remove_broker(name):
-            self._orphans[robot] = now
+            self._orphans[robot] = name, now
             self._settle(robot, now)
         log.info("mesh: broker %s is gone", name)
 
@@ -271,6 +272,7 @@ class Mesh:
             self.claims.set(broker, rest)
         else:
             self.claims.remove(broker, claim.robot)
+            self._orphans[claim.robot] = broker, now
         self._settle(claim.robot, now)
 
     def frame_came(self, sender: str, urgency: int, data: bytes, now: float) -> None:
@@ -477,11 +479,12 @@ class Mesh:
 
     def _tell_orphans(self, now: float) -> None:
         """One of the brokers that are left says that a robot is gone with its broker."""
-        for robot, since in list(self._orphans.items()):
+        for robot, (owner, since) in list(self._orphans.items()):
             if now - since > ORPHANED_S:
                 del self._orphans[robot]
                 first = all(self.own < neighbour.name for neighbour in self.neighbours)
-                if first and self.claims.owner(robot) is None and self._router.find(robot) is None:
+                gone = self.neighbours.find(owner) is None
+                if first and gone and self.claims.owner(robot) is None and self._router.find(robot) is None:
                     self._hub.orphaned(robot)
 
     def _guard(self, now: float) -> None:
