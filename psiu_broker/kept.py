@@ -1,7 +1,6 @@
 """What a link and a trunk have in common: an adapter opens it, it is kept open, and its trouble stays its own."""
 
 import asyncio
-import contextlib
 import logging
 import random
 import time
@@ -112,8 +111,9 @@ class Kept(ABC):
                 await asyncio.sleep(pause_s)
         finally:
             changed.cancel()
-            with contextlib.suppress(asyncio.CancelledError, Exception):
-                await changed
+            await asyncio.wait({changed})  # a cancellation that comes now is ours, not that of `changed`
+            if not changed.cancelled():
+                changed.exception()  # has been told, or comes too late to matter
 
     def _set_state(self, state: State, reason: str | None) -> None:
         """Attempts to open are no news while they end as the last one did."""

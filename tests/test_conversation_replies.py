@@ -7,6 +7,7 @@ import pytest
 from scripted_robots import MNERIM, Robots, jumping, now, refused
 
 from psiu_broker.conversation.late_replies import OWED_KEPT
+from psiu_broker.conversation.turns import WAITING_KEPT
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address, Frame
 
@@ -372,6 +373,24 @@ async def test_of_the_set_points_that_a_call_holds_up_the_newest_is_sent() -> No
     await asyncio.wait([call, *puts])
     assert robots.payloads == [b"\x04\x00", b"\x04\x40"]
     assert [str(put.exception()) for put in puts[:2]] == ["a newer garra came while BRACO was at other calls"] * 2
+    assert robots.idle
+
+
+@jumping
+async def test_of_a_burst_of_set_points_the_newest_is_sent() -> None:
+    robots = Robots()
+    robots.script = lambda _: [(1, b"A")]
+    call = asyncio.ensure_future(robots.hexa("garra", 0))
+    await asyncio.sleep(0.1)
+    puts = [
+        asyncio.ensure_future(robots.conversations.tell(robots.of_bytes(), "garra", [n - 90], fresh_s=2))
+        for n in range(2 * WAITING_KEPT)
+    ]
+    outcomes = await asyncio.gather(*puts, return_exceptions=True)
+    assert [outcome for outcome in outcomes[:-1] if outcome is None] == []
+    assert outcomes[-1] is None
+    await call
+    assert len(robots.sent) == 2
     assert robots.idle
 
 

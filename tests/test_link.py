@@ -409,6 +409,29 @@ async def test_a_device_that_appears_ends_the_pause(hub: Hub, monkeypatch: pytes
         await hub.until(lambda: hub.events == ["opened"])
 
 
+async def test_a_link_that_is_told_to_end_just_as_its_pause_ends_ends(hub: Hub) -> None:
+    cleans_up, clean = asyncio.Event(), asyncio.Event()
+
+    class Slow(MemoryAdapter):
+        async def changed(self) -> None:
+            try:
+                await asyncio.Event().wait()
+            finally:
+                cleans_up.set()
+                await clean.wait()
+
+    adapter = Slow()
+    adapter.fail()
+    link = make(hub, adapter)
+    task = asyncio.create_task(link.run())
+    await cleans_up.wait()
+    task.cancel()
+    await asyncio.wait({task}, timeout=1)
+    clean.set()
+    assert task.cancelled()
+    assert link.state == "closed"
+
+
 async def test_the_pause_grows_in_vain_and_shrinks_only_when_bytes_arrive(hub: Hub) -> None:
     adapter = MemoryAdapter()
     adapter.fail()

@@ -22,23 +22,29 @@ class Aside:
         self._last: Future[Any] | None = None
 
     async def run(self, work: Callable[[], T], unwanted: Callable[[T], object] = lambda _: None) -> T:
-        """What `work` returns or raises; `unwanted` takes what it returns after a cancellation, in its thread.
+        """What `work` returns or raises; `unwanted` takes what it returns after a cancellation, in a thread as well.
 
         Waits first for work that was begun before and is still under way, cancelled or not.
         """
         while self._last is not None and not self._last.done():
             with suppress(Exception):  # it has been told to whom it concerns
                 await asyncio.wrap_future(self._last)
-        begun: Future[T] = Future()
-        # From now on a cancellation reaches the waiting only, not the work.
-        begun.set_running_or_notify_cancel()
-        self._last = begun
-        threading.Thread(target=_carry_out, args=(work, begun), name=f"aside: {self._name}", daemon=True).start()
+        begun = self._begin(work)
         try:
             return await asyncio.wrap_future(begun)
         except asyncio.CancelledError:
-            begun.add_done_callback(lambda ended: None if ended.exception() else unwanted(ended.result()))
+            with suppress(RuntimeError):  # no thread to be had: the cancellation counts
+                self._begin(lambda: unwanted(begun.result()))
             raise
+
+    def _begin(self, work: Callable[[], T]) -> "Future[T]":
+        """Raises RuntimeError where the system has no thread for it."""
+        begun: Future[T] = Future()
+        # From now on a cancellation reaches the waiting only, not the work.
+        begun.set_running_or_notify_cancel()
+        threading.Thread(target=_carry_out, args=(work, begun), name=f"aside: {self._name}", daemon=True).start()
+        self._last = begun
+        return begun
 
 
 def _carry_out(work: Callable[[], T], begun: "Future[T]") -> None:

@@ -43,7 +43,8 @@ class Turns:
             CallError: busy, too many wait; expired, no turn came or a newer one did.
         """
         lane = self._lanes.setdefault(robot, _Lane())
-        if lane.users > WAITING_KEPT:
+        replaces = replaceable and command in lane.replaceable
+        if lane.users > WAITING_KEPT and not replaces:
             raise CallError("busy", f"{WAITING_KEPT} calls to {name} wait already")
         lane.users += 1
         try:

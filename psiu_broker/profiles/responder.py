@@ -23,7 +23,7 @@ NAMES_AT_ONCE: Final = 4
 NAME_EVERY_S: Final = 30.0
 """In the long run, for one who asks us by our name; who asks everyone is always told."""
 REFUSE_EVERY_S: Final = 2.0
-"""As long as a robot has to answer: its late value must not be met with a falha that it answers in turn."""
+"""As long as a robot has to answer: its late value must not be met with a falha or WTF that it answers in turn."""
 
 
 class Responder:
@@ -89,6 +89,8 @@ class Responder:
             if payload[0] != AVAILABLE:
                 return None
             return psiu_hexa.packet(frame.destination, frame.source, bytes((FREE,)))
+        if not self._rarely.may((frame.source, "wtf"), now, REFUSE_EVERY_S):
+            return None
         return psiu_hexa.packet(frame.destination, frame.source, bytes((WTF,)))
 
 

@@ -96,6 +96,42 @@ async def test_the_next_work_waits_for_the_last_although_that_was_cancelled(stuc
     assert order == ["first", "second"]
 
 
+async def test_what_comes_with_a_cancellation_is_handed_over_in_a_thread_too() -> None:
+    handed_over = threading.Event()
+    threads: list[threading.Thread] = []
+
+    def take(_: int) -> None:
+        threads.append(threading.current_thread())
+        handed_over.set()
+
+    aside = Aside("test")
+    cancelled = asyncio.create_task(aside.run(lambda: 7, take))
+    await asyncio.sleep(0)
+    work = aside._last
+    assert work is not None
+    work.result(PATIENCE_S)  # the loop stands still: the work ends before the loop can know
+    cancelled.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await cancelled
+    assert await asyncio.to_thread(handed_over.wait, PATIENCE_S)
+    assert threads != [threading.current_thread()]
+    async with asyncio.timeout(PATIENCE_S):
+        assert await aside.run(lambda: 8) == 8
+
+
+async def test_a_system_without_threads_for_a_moment_harms_only_that_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    aside = Aside("test")
+    with monkeypatch.context() as moment:
+        moment.setattr(threading.Thread, "start", refuse)
+        with pytest.raises(RuntimeError, match="thread"):
+            await aside.run(lambda: 7)
+    async with asyncio.timeout(PATIENCE_S):
+        assert await aside.run(lambda: 8) == 8
+
+
 async def test_what_comes_after_a_cancellation_is_handed_over(stuck: threading.Event) -> None:
     began, handed_over = threading.Event(), threading.Event()
     unwanted: list[str] = []

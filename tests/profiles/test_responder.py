@@ -247,6 +247,17 @@ def test_a_refusal_for_a_robot_spoken_for_is_said_once_in_two_seconds_to_each_fo
     assert refused("garra 500", 2.1, source=BASE)
 
 
+def test_a_robot_whose_values_come_late_hears_one_wtf_in_two_seconds() -> None:
+    responder = Responder("base")
+
+    def told(now: float, source: Address = ARM) -> bool:
+        return responder.answer(psiu_hexa.packet(source, OURS, bytes((0, 42))), now) is not None
+
+    assert sum(told(number / 100) for number in range(100)) == 1
+    assert told(1.0, Address.numbered(0x13))
+    assert told(2.1)
+
+
 def test_a_broker_with_more_commands_lists_them() -> None:
     responder = Responder("base", [Command(name="acorde")])
     answer = responder.answer(ask("exibecomando 1"), 0.0)
