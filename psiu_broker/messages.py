@@ -268,12 +268,12 @@ class MeshRobot(Message):
 
 
 class Conflict(Message):
-    """One name that more than one robot seems to have."""
+    """One name that more than one robot, or broker, seems to have."""
 
     robot: str
     brokers: list[str]
     since: Moment
-    detail: str
+    detail: str = Field(description="what it means, and what to do")
 
 
 class Mesh(Message):

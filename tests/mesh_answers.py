@@ -33,7 +33,7 @@ def robot(name: str, owner: str, **more: Any) -> MeshRobot:
 
 def conflict(name: str, *brokers: str, later_s: float = 0) -> Conflict:
     since = NOW + timedelta(seconds=later_s)
-    return Conflict(robot=name, brokers=list(brokers), since=since, detail="3 changes of owner in 30 s")
+    return Conflict(robot=name, brokers=list(brokers), since=since, detail="by turns; rename one of them")
 
 
 def mesh(name: str, *others: MeshBroker, robots: Iterable[MeshRobot] = (), conflicts: Iterable[Conflict] = ()) -> Mesh:

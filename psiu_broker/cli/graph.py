@@ -205,6 +205,8 @@ def _node(broker: Broker, placed: _Placed, contested: frozenset[str]) -> Iterato
             pill = _Box(left + placed.column_w / 2, top + _PILL_H / 2, placed.column_w / 2, _PILL_H / 2)
             yield from _pill(robot, pill, contested=robot.told.robot in contested)
     colour, dash = (_BLUE, "") if broker.answers else (_GREY, ' stroke-dasharray="4 4"')
+    if broker.name in contested:
+        colour = _RED
     yield "<g>"
     yield f"<title>{_escaped(broker.name)}</title>"
     yield _rect(box, 12, fill="#ffffff", stroke=colour, more=f' class="broker" stroke-width="2"{dash}')

@@ -59,7 +59,7 @@ def mesh(connection: Connection, file: str | None) -> None:
     \b
     broker    name, since, robots, mode, whether it answers, Zenoh id
     link      broker, broker, round trip in ms, frames there, frames back, lost, how
-    robot     robot, address, protocol, owner, link, quality, age in s, known to
+    robot     robot, address, protocol, owner, link, quality, age in s, known to, claimed by
     conflict  robot, brokers, since, detail
     split     broker, seen by, not seen by
 
@@ -98,7 +98,7 @@ def show_mesh(view: View, *, drawn: bool) -> None:
     print_table(between, [_pair(each) for each in view.pairs], printable(alone))
     click.echo()
     answering = tuple(each.name for each in view.brokers if each.answers)
-    heads = ("robot", "owner", "link", "quality", "heard", "known to")
+    heads = ("robot", "owner", "link", "quality", "heard", "claimed by", "known to")
     rows = [_robot(each, answering) for each in view.robots]
     print_table(heads, rows, "No robot is announced yet. Ask who is there: psiu discover")
     for conflict in view.conflicts:
@@ -132,14 +132,14 @@ def _robot(robot: Robot, answering: tuple[str, ...]) -> Sequence[Cell]:
     name = told.robot if told.address in (None, told.robot) else f"{told.robot} {told.address}"
     heard = "never" if told.age_s is None else ago(told.age_s)
     known_to = "all" if robot.known_to == answering else ", ".join(robot.known_to)
-    return name, told.owner, told.link, f"{told.quality:.0%}", heard, known_to
+    return name, told.owner, told.link, f"{told.quality:.0%}", heard, ", ".join(robot.claimed_by), known_to
 
 
 def _robot_row(robot: Robot) -> Sequence[Cell]:
     told = robot.told
     return (
         told.robot, told.address, told.protocol, told.owner, told.link, told.quality, told.age_s,
-        " ".join(robot.known_to),
+        " ".join(robot.known_to), " ".join(robot.claimed_by),
     )  # fmt: skip
 
 
@@ -148,10 +148,7 @@ def _rounded(ms: float | None) -> float | None:
 
 
 def _conflict(conflict: Conflict) -> str:
-    return (
-        f"{conflict.robot} is two robots: {' and '.join(conflict.brokers)} hear one each ({conflict.detail}). "
-        "Give one of them another name, or switch it off."
-    )
+    return f"Conflict: {conflict.robot} at {', '.join(conflict.brokers)}: {conflict.detail}."
 
 
 def _split(split: Split) -> str:

@@ -50,6 +50,9 @@ class Robot:
 
     told: MeshRobot
     known_to: tuple[str, ...]
+    """The brokers that take this owner for the owner."""
+    claimed_by: tuple[str, ...]
+    """The brokers that say that it is on a link of theirs."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class View:
 
     @property
     def contested(self) -> frozenset[str]:
-        """The names that more than one robot seems to have."""
+        """The names that more than one robot or broker seems to have."""
         return frozenset(conflict.robot for conflict in self.conflicts)
 
     def robots_of(self, broker: str) -> list[Robot]:
@@ -135,12 +138,19 @@ def _pair(a: str, b: str, by_a: MeshBroker | None, by_b: MeshBroker | None, *, b
 def _robots(by_name: dict[str, Mesh]) -> tuple[Robot, ...]:
     """Each robot as its owner tells it, or else as who heard of it last."""
     told: dict[tuple[str, str], dict[str, MeshRobot]] = {}
+    claimed_by: dict[str, set[str]] = {}
     for name, mesh in by_name.items():
-        for robot in mesh.robots:
+        owned: dict[str, MeshRobot] = {}
+        for claim in sorted(mesh.robots, key=lambda each: (each.term, each.owner)):
+            owned[claim.robot] = claim  # the highest of several is the owner's
+            claimed_by.setdefault(claim.robot, set()).add(claim.owner)
+        for robot in owned.values():
             told.setdefault((robot.robot, robot.owner), {})[name] = robot
     return tuple(
-        Robot(by.get(owner) or max(by.values(), key=lambda each: each.term), tuple(by))
-        for (_, owner), by in sorted(told.items())
+        Robot(
+            by.get(owner) or max(by.values(), key=lambda each: each.term), tuple(by), tuple(sorted(claimed_by[robot]))
+        )
+        for (robot, owner), by in sorted(told.items())
     )
 
 

@@ -58,8 +58,8 @@ def test_a_pipe_gets_lines_that_begin_with_what_they_are(bus: Bus, tool: Run) ->
         ["broker", "base", since, "0", "peer", "yes", "id-base"],
         ["broker", "north", since, "1", "peer", "yes", "id-north"],
         ["link", "base", "north", "0.5", "0", "0", "0", "direct"],
-        ["robot", "BRACO", "0x12", "psiu-ascii", "north", "radio", "0.9", "3.0", "base north"],
-        ["conflict", "BRACO", "base north", since, "3 changes of owner in 30 s"],
+        ["robot", "BRACO", "0x12", "psiu-ascii", "north", "radio", "0.9", "3.0", "base north", "north"],
+        ["conflict", "BRACO", "base north", since, "by turns; rename one of them"],
     ]
 
 
@@ -86,8 +86,7 @@ def test_a_terminal_gets_tables_and_what_to_do(capsys: pytest.CaptureFixture[str
     shown = capsys.readouterr().out
     for words in ("round trip", "0.50 ms", "only gate sees it", "BRACO 0x12", "90%", "3 s ago"):
         assert words in shown
-    assert "BETA is two robots: a and b hear one each" in shown
-    assert "another name" in shown
+    assert "Conflict: BETA at a, b: by turns; rename one of them." in shown
     assert "north is seen by base but not by gate" in shown
 
 

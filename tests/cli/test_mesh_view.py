@@ -56,6 +56,13 @@ def test_a_robot_is_there_once_as_its_owner_tells_it() -> None:
     assert view.robots_of("base") == []
 
 
+def test_of_several_that_claim_a_robot_the_highest_claim_is_the_owner_s() -> None:
+    claims = [robot("BETA", "base", term=3), robot("BETA", "gate", term=3), robot("BETA", "north", term=2)]
+    (beta,) = composed(full("base", "gate", "north", robots=claims)).robots
+    assert (beta.told.owner, beta.claimed_by) == ("gate", ("base", "gate", "north"))
+    assert len(beta.known_to) == 3
+
+
 def test_brokers_that_do_not_agree_on_an_owner_are_both_shown() -> None:
     view = composed(
         [
