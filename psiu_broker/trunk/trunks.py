@@ -1,15 +1,22 @@
 """All trunks of a broker, and the folder in which they meet its Zenoh session."""
 
+import logging
+import os
 import shutil
 import tempfile
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from psiu_broker.config import TrunkConfiguration
 from psiu_broker.trunk.local import Meeting
 from psiu_broker.trunk.trunk import Trunk
+
+FOLDER_MAX: Final = 60
+"""A Unix socket's path has no more than 107 bytes."""
+
+log = logging.getLogger(__name__)
 
 
 class Endpoints(NamedTuple):
@@ -34,19 +41,33 @@ class Trunks:
         """Where a session that is about to open meets the trunks; they leave the one that was there before."""
         if not self._all:
             return Endpoints()
-        # A folder that only this user may enter, and a new one: a session lost to a panic may still be in the old one.
-        former, self._folder = self._folder, Path(tempfile.mkdtemp(prefix="psiu-trunks-"))
+        # A new one each time: a session lost to a panic may still be in the old one.
+        former, self._folder = self._folder, _new_folder()
+        _remove(former)
+        if self._folder is None:
+            return Endpoints()
         session = self._folder / "session"
         doors = [self._folder / str(number) for number in range(len(self._all))]
         for trunk, door in zip(self._all, doors, strict=True):
             trunk.move(Meeting(door, session))
-        _remove(former)
         return Endpoints([_endpoint(session)], [_endpoint(door) for door in doors])
 
     def close(self) -> None:
         """Leave nothing behind, when the trunks have ended and the session is closed."""
         _remove(self._folder)
         self._folder = None
+
+
+def _new_folder() -> Path | None:
+    """One that only this user may enter; None where none can be made, which stops nothing but the trunks."""
+    folder = tempfile.gettempdir()
+    if len(os.fsencode(folder)) > FOLDER_MAX:
+        folder = "/tmp"  # noqa: S108 - mkdtemp
+    try:
+        return Path(tempfile.mkdtemp(prefix="psiu-trunks-", dir=folder))
+    except OSError as error:
+        log.warning("the trunks cannot meet Zenoh: %s", error)
+        return None
 
 
 def _endpoint(path: Path) -> str:

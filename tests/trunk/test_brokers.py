@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import os
 import socket
+import tempfile
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from broker_process import BrokerProcess
 from stream_relay import Relay
 
 from psiu_broker.broker import Broker
@@ -198,10 +201,26 @@ async def test_a_session_that_was_lost_is_replaced_without_a_new_stream(lab: Lab
     assert relay.joined == 1
 
 
-async def test_nothing_is_left_behind(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (folder := tmp_path / "temporary").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(folder))
-    broker = Broker(load(lab.files[0].with_name("base.toml")))
-    with pytest.raises(BusError, match="in use"):
-        await broker.start()
-    assert list(folder.iterdir()) == []
+async def test_a_broker_that_cannot_start_leaves_nothing_behind(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        monkeypatch.setattr(tempfile, "tempdir", folder)
+        with pytest.raises(BusError, match="in use"):
+            await Broker(load(lab.files[0])).start()
+        assert os.listdir(folder) == []  # noqa: PTH208
+
+
+async def test_two_processes_are_one_network_also_after_one_was_killed(tmp_path: Path, relay: Relay) -> None:
+    device = '[trunks.far]\nadapter = "serial"\ndevice = "socket://127.0.0.1:{}"\n'
+    base, hill = (
+        BrokerProcess(tmp_path, name, device.format(port))
+        for name, port in zip(("base", "hill"), relay.ports, strict=True)
+    )
+    both = {name: {"broker": name} for name in ("base", "hill")}
+    async with base.running():
+        for _ in range(2):
+            async with hill.running() as process:
+                await base.until("status", both)
+                await hill.until("status", both)
+                process.kill()
+            await base.until("trunks", {"base": {"state": "opening", "far": None}})
+    assert relay.joined == 2

@@ -12,7 +12,7 @@ from memory_adapter import MemoryAdapter
 from psiu_broker import kept
 from psiu_broker.config import TrunkConfiguration
 from psiu_broker.errors import LinkLost
-from psiu_broker.trunk import Trunk, channel, local
+from psiu_broker.trunk import Trunk, channel, local, trunk
 from psiu_broker.trunk.local import Meeting
 from psiu_broker.trunk.wire import END, Greeting, Reader, chunk
 
@@ -96,6 +96,7 @@ class Lab:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kept, "FIRST_PAUSE_S", 0.004)
+    monkeypatch.setattr(trunk, "FIRST_PAUSE_S", 0.004)
     monkeypatch.setattr(kept, "SHORTEST_PAUSE_S", 0.002)
 
 
