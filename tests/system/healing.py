@@ -103,8 +103,12 @@ class Watch:
         return [f"{what} healed after {at - since:.1f} s; missing at {within_s:g} s: {missing}"], at
 
     async def _views(self) -> list[str]:
-        """What each broker says of the mesh, for the report."""
-        return [f"{self._lab.brokers[node].name} says {await self._lab.ask(node, 'mesh')}" for node in self._lab.nodes]
+        """What each broker says of the mesh and of its frames, for the report."""
+        return [
+            f"{self._lab.brokers[node].name} says {what}: {await self._lab.ask(node, what)}"
+            for node in self._lab.nodes
+            for what in ("mesh", "ledger", "routes")
+        ]
 
     async def _settle(self) -> list[str]:
         """Wait until the books of all brokers agree; what does not, in words."""
