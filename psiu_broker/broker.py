@@ -4,6 +4,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from math import inf
 from typing import Any, Final
 
 from psiu_broker import __version__
@@ -37,6 +38,7 @@ from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
 from psiu_broker.routing.duplicates import Duplicates
+from psiu_broker.routing.outbox import is_stop
 from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.router import SELF, Router
 from psiu_broker.routing.verdicts import Verdict
@@ -47,6 +49,10 @@ log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.1
 """How often what is too late is dropped and cards that changed are put."""
+STOOD_STILL_S: Final = 1.0
+"""A pause between ticks that is no mere load: the process was stopped, or the computer slept."""
+STALE_S: Final = 0.3
+"""How long after that calls may still come that had waited meanwhile."""
 LOOK_AROUND_S: Final = 0.5
 DOUBLES_MARGIN_S: Final = 2.0
 """A frame may wait its age limit in an outbox, and this long elsewhere, before its double is no longer known."""
@@ -101,6 +107,7 @@ class Broker:
         self._changed: dict[Address, table.Route] = {}
         self._seen: dict[str, float] = {}
         self._ticked = time.monotonic()
+        self._stale_until = -inf
         self._bus: _Bus | None = None
         self._bus_lost = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
@@ -121,6 +128,7 @@ class Broker:
         except BaseException:
             self._trunks.close()
             raise
+        self._ticked = time.monotonic()
         create = asyncio.get_running_loop().create_task
         self._tasks = [
             create(self._tick(), name="tick"),
@@ -351,6 +359,9 @@ class Broker:
 
     def _look_after(self, now: float) -> None:
         """Drop what is too late, and put the cards that changed."""
+        if now - self._ticked > STOOD_STILL_S:
+            log.warning("stood still for %.1f s; calls that came meanwhile are refused", now - self._ticked)
+            self._stale_until = now + STALE_S
         self._ticked = now
         self.exchange.expire(now)
         for link in self.exchange.links.values():
@@ -390,6 +401,7 @@ class Broker:
         """None: another broker has the robot, and answers."""
         if self._is_elsewhere(robot):
             return None
+        self._refuse_what_is_stale(command)
         try:
             answer = await self.resident.call(robot, command, request)
         except CallError:
@@ -418,7 +430,15 @@ class Broker:
 
     async def send(self, robot: Address, command: str, request: CallRequest) -> None:
         if not self._is_elsewhere(robot):
+            self._refuse_what_is_stale(command)
             await self.resident.tell(robot, command, request)
+
+    def _refuse_what_is_stale(self, command: str) -> None:
+        """Raise CallError for what came while the broker stood still: nobody knows how long it waited."""
+        now = time.monotonic()
+        stale = now < self._stale_until or now - self._ticked > STOOD_STILL_S
+        if stale and not is_stop(command):
+            raise CallError("expired", "the broker stood still for a while; nothing was sent")
 
     def _is_elsewhere(self, robot: Address) -> bool:
         """Whether another broker has the robot, and its calls."""
