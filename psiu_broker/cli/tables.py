@@ -8,7 +8,7 @@ import click
 from psiu_broker.cli.commands import Failure, examples
 from psiu_broker.cli.connection import Connection, connects
 from psiu_broker.cli.output import Cell, ago, on_terminal, print_json, print_rows, print_table, printable, styled
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status, Trunk
 from psiu_broker.profiles.psiu import QUESTIONS
 
 Told = Sequence[tuple[str, Any]]
@@ -45,14 +45,18 @@ def links(connection: Connection) -> None:
 
     In a pipe each line has, between tabs: link, adapter, protocol, state, reason, robots, frames in, frames out,
     malformed, queued, times reopened, peers, broker. With --json: a list (psiu schema Link).
+
+    On a terminal the trunks to other brokers follow, where there are any; a program gets them from the key
+    psiu/@broker/{broker}/trunks (psiu schema Trunk).
     """
     told = _ask(connection, "links")
     if connection.as_json:
         _print_each(told)
-    else:
-        show_links(
-            [(broker, Link.model_validate(link)) for broker, found in told for link in found], drawn=on_terminal()
-        )
+        return
+    show_links([(broker, Link.model_validate(link)) for broker, found in told for link in found], drawn=on_terminal())
+    if on_terminal():
+        told = _ask(connection, "trunks")
+        show_trunks([(broker, Trunk.model_validate(trunk)) for broker, found in told for trunk in found])
 
 
 @click.command(epilog=examples("psiu routes", "psiu routes --json"))
@@ -140,6 +144,21 @@ def show_links(found: Links, *, drawn: bool) -> None:
          link.malformed, link.queued, link.reopened, " ".join(link.peers), broker)
         for broker, link in found
     )  # fmt: skip
+
+
+def show_trunks(found: Sequence[tuple[str, Trunk]]) -> None:
+    """For a reader; nothing where there are none."""
+    if not found:
+        return
+    click.echo()
+    heads = ("trunk", "adapter", "state", "far end", "bytes in", "bytes out")
+    rows = [(broker, (t.name, t.adapter, t.state, t.far, t.bytes_in, t.bytes_out)) for broker, t in found]
+    print_table(*_with_brokers(heads, rows), "")
+    for _, trunk in found:
+        if trunk.reason:
+            click.echo(f"trunk {trunk.name} is {trunk.state}: {printable(trunk.reason)}")
+        if trunk.overruns:
+            click.echo(f"trunk {trunk.name}: Zenoh did not read in time, {trunk.overruns} connections were given up")
 
 
 def show_routes(found: Routes) -> None:

@@ -47,6 +47,9 @@ topology = "point-to-point"
 adapter = "serial"
 device = "/dev/serial/by-id/none"
 protocol = "psiu-ascii"
+[trunks.hill]
+adapter = "serial"
+device = "socket://127.0.0.1:1"
 [robots.BRACO]
 address = 0x12
 link = "arm"

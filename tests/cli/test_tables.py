@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import subprocess
 from collections.abc import Callable
 from typing import Any
@@ -99,6 +100,8 @@ def test_a_terminal_gets_tables_with_heads_and_reasons(lab: Any) -> None:
     lines = text.decode().splitlines()
     assert "malformed" in lines[0]
     assert any(line.startswith("lost is ") and "/dev/serial/by-id/none" in line for line in lines)
+    assert any("far end" in line for line in lines)
+    assert re.search(r"trunk hill is (waiting|opening): .*connection refused", lines[-1])
 
 
 @pytest.mark.parametrize("command", ["robots", "links", "routes", "ledger", "status", "discover", "monitor"])
