@@ -20,7 +20,7 @@ from psiu_broker.profiles import HexaProfile, Profile, PsiuProfile
 from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, listed
 from psiu_broker.routing.router import SELF
 from psiu_broker.routing.table import Route
-from psiu_broker.routing.verdicts import DELIVERED, Verdict
+from psiu_broker.routing.verdicts import DELIVERED, LINK_DOWN, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,8 @@ SOUGHT_S: Final = 1.0
 """How long a call waits for an unknown robot to answer to its name."""
 LISTENING_S: Final = 0.6
 """How long a discovery waits for robots to say their names."""
+DISCOVERY_S: Final = 30.0
+"""How long a discovery may take where nobody says."""
 COMMANDS_ASKED: Final = 64
 _MOMENT_S: Final = 0.001
 """An outbox reads its clock a moment after a call does."""
@@ -146,13 +148,13 @@ class Calling:
         self._profiles.pop(route.robot, None)
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
-        self.conversations.undelivered(frame, _dropped(frame.destination, verdict))
+        self.conversations.undelivered(frame, self._dropped(frame.destination, verdict))
 
     # conversation.Links
 
     def send(self, frame: Frame, patience_s: float) -> CallError | None:
         verdict = self._exchange.send(frame, self._clock(), patience_s)
-        return None if verdict is None or verdict == DELIVERED else _dropped(frame.destination, verdict)
+        return None if verdict is None or verdict == DELIVERED else self._dropped(frame.destination, verdict)
 
     def expire(self, link: str) -> None:
         self._exchange.links[link].expire(self._clock() + _MOMENT_S)
@@ -165,6 +167,13 @@ class Calling:
         return Traffic(found.frames_out, max(found.last_sent, last_heard), found.frames_in)
 
     # Inside.
+
+    def _dropped(self, robot: Address, verdict: Verdict) -> CallError:
+        code, text = _DROPPED.get(verdict, ("refused", verdict))
+        route = self._router.find(robot)
+        link = None if route is None else self._exchange.links.get(route.way.link)
+        reason = f" ({link.reason})" if verdict == LINK_DOWN and link is not None and link.reason else ""
+        return CallError(code, f"{robot}: {text}{reason}")
 
     def _robot(self, route: Route) -> Robot:
         """Who we are to the robot, who it is to us, and how a request becomes a frame between us."""
@@ -209,7 +218,7 @@ class Calling:
         values: list[str | int | float]
         match command, request.parameters:
             case "discover", []:
-                values = list(await self._discover(request.timeout_s))
+                values = list(await self._discover(request.timeout_s or DISCOVERY_S))
             case "qualseunome", []:
                 values = [str(self.name)]
             case "quantoscomandos", []:
@@ -258,7 +267,7 @@ class Calling:
             )
         raise CallError("link_down", f"{robot} was on {link.name}, which went down {ago_s:.0f} s ago: {link.reason}")
 
-    async def _discover(self, timeout_s: float | None) -> list[str]:
+    async def _discover(self, timeout_s: float) -> list[str]:
         """Ask where everyone may be asked who is there, then each robot for its commands.
 
         Returns:
@@ -297,8 +306,3 @@ class Calling:
 
 def _elsewhere(route: Route) -> CallError:
     return CallError("unknown_robot", f"{route.robot} is with broker {route.way.peer}")
-
-
-def _dropped(robot: Address, verdict: Verdict) -> CallError:
-    code, text = _DROPPED.get(verdict, ("refused", verdict))
-    return CallError(code, f"{robot}: {text}")

@@ -205,7 +205,7 @@ class Report:
             link=None if link is None else link.name,
             age_s=None if heard_at is None else round(self._clock() - heard_at, 3),
             filter=self._filter(decision, protocol, arrived, target, link),
-            cost_ms=None if link is None or decision.action == "drop" else _cost_ms(link),
+            cost_ms=None if link is None or decision.verdict is not None else _cost_ms(link),
         )
 
     def _where(self, address: Address, route: table.Route | None) -> str:
@@ -233,7 +233,7 @@ class Report:
                 return f"sent to {', '.join(map(str, decision.hops))}"
             case "answer" | "flood":
                 return "the broker answers it"
-            case "translate":
+            case "translate" if decision.verdict is None:
                 return f"{destination} speaks {target and target.protocol}: the broker asks it and answers in its name"
             case "ask":
                 asked = ", ".join(map(str, decision.hops))
@@ -248,7 +248,7 @@ class Report:
     ) -> str | None:
         """What did or could stop a frame, or keeps it from some links."""
         match decision.action:
-            case "drop":
+            case "drop" | "translate" if decision.verdict is not None:
                 return self._stopped(decision, protocol, arrived, target, link)
             case "flood" | "ask":
                 kept = [

@@ -23,7 +23,7 @@ from psiu_broker.profiles.psiu import NAME, said
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.profiles.responder import outcome, refusal
 from psiu_broker.routing.table import Route
-from psiu_broker.routing.verdicts import ANSWERED, REFUSED, Verdict
+from psiu_broker.routing.verdicts import ANSWERED, LINK_DOWN, REFUSED, Verdict
 
 __all__ = ["DISCOVER", "Resident"]
 
@@ -81,12 +81,13 @@ class Resident:
         route = self._router.find(frame.destination)
         if route is None or len(self._tasks) >= TASKS_KEPT:
             return REFUSED
-        told = self._responder.listed(frame, str(route.robot), self.commands(route), now)
+        down = self._exchange.links[route.way.link].state != "open"
+        told = None if down else self._responder.listed(frame, str(route.robot), self.commands(route), now)
         if told is not None:
             self._exchange.send(told, now)
         elif not said(frame).answer:
             self._start(self._ask_for(frame, route, now))
-        return ANSWERED
+        return LINK_DOWN if down else ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         if malformed.reason == COMPLAINT:

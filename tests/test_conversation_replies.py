@@ -268,6 +268,17 @@ async def test_of_two_puts_alike_it_is_the_dropped_one_that_is_not_owed_for() ->
 
 
 @jumping
+async def test_of_two_puts_alike_only_the_one_that_left_is_owed_for() -> None:
+    robots = Robots()
+    robots.stuck = True
+    for _ in range(2):
+        await robots.conversations.tell(robots.of_bytes(), "garra", [10], fresh_s=2)
+    robots.conversations.delivered(robots._kept[0][1], now())
+    assert robots.says(b"A")
+    assert not robots.says(b"A")
+
+
+@jumping
 async def test_polls_that_never_left_are_not_owed_for() -> None:
     robots = Robots(busy_poll_s=0.1)
     robots.script = lambda frame: [(0.01, b"F" if frame.payload == b"?" else b"BA"[len(robots.sent) > 1 :][:1])]

@@ -135,8 +135,11 @@ def test_what_stops_a_frame_is_named(world: World, a: Address, b: Address, verdi
 
 def test_a_link_that_is_down_stops_it(world: World) -> None:
     world.exchange.links["arm"].lost(LinkLost("unplugged"))
-    why = world.why(PC, ARM)
-    assert (why.verdict, why.link, why.filter) == ("link_down", "arm", "arm is waiting")
+    for a in (PC, Address.numbered(0)):
+        why = world.why(a, ARM)
+        assert (why.verdict, why.link, why.filter, why.cost_ms) == ("link_down", "arm", "arm is waiting", None)
+        assert not why.delivered
+        assert why.steps[-1] == "dropped (link_down): its link is down"
 
 
 def test_what_the_broker_answers_leaves_on_no_link(world: World) -> None:

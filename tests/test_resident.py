@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
 
+from psiu_broker import calling
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
@@ -27,7 +28,7 @@ from psiu_broker.messages import Answer, CallRequest
 from psiu_broker.profiles import Node
 from psiu_broker.profiles.rarely import REMEMBERED
 from psiu_broker.profiles.responder import NAMES_AT_ONCE
-from psiu_broker.resident import Resident
+from psiu_broker.resident import TASKS_KEPT, Resident
 from psiu_broker.routing.router import Router
 from psiu_broker.routing.table import Binding, Route
 
@@ -90,13 +91,12 @@ class Lab:
             own[Address.numbered(0)] = "psiu-hexa"
         for each in robots_of_bytes:
             bindings += (Binding(Address.named(f"R{each}"), Address.numbered(each), Way("field"), "psiu-hexa"),)
-        self.router = Router(own, bindings, identity, heard=self._heard)
+        self.router = Router(own, bindings, identity, self._heard, self._gone)
         self.exchange = Exchange(Address.named(name), self.router)
         made = Configuration(
             BrokerConfiguration(name=name), ZenohConfiguration(), {link.name: link for link in links}, robots
         )
         self.resident = self.exchange.resident = Resident(made, self.exchange)
-        self.exchange.withdrawn = self.resident.robot_gone
         directory = Directory({name}, {0})
         self.links: dict[str, Link] = {}
         self.far: dict[str, MemoryTransport] = {}
@@ -112,6 +112,9 @@ class Lab:
         self.resident.robot_heard(route)
         for address in route.addresses:
             self.exchange.release(address, time.monotonic())
+
+    def _gone(self, route: Route) -> None:
+        self.resident.robot_gone(route)
 
     def connect(self, link: str, transport: MemoryTransport) -> None:
         self.far[link] = transport
@@ -241,6 +244,23 @@ async def test_one_refusal_is_said_once_in_a_while(labs: Labs) -> None:
     lab.hears("radio", wire("PC", "BRACO", "perna"))
     await settled()
     assert said(lab.far["radio"]) == ["PC garra falha BRACO", "PC perna falha BRACO"]
+
+
+async def test_words_for_a_robot_of_bytes_whose_link_is_down_are_answered_with_falha(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    lab.links["arm"].lost(LinkLost("unplugged"))
+    for message in ("garra 45", "quantoscomandos", "qualseunome", "garra sucesso"):
+        lab.hears("radio", wire("PC", "BRACO", *message.split()))
+    await settled()
+    assert said(lab.far["radio"]) == ["PC garra falha BRACO", "PC quantoscomandos falha BRACO"]
+    assert lab.exchange.accounts["radio"].fates["link_down"] == 4
+
+
+async def test_what_waits_for_a_silent_arm_is_bounded(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for _ in range(TASKS_KEPT + 2):
+        lab.hears("radio", wire("PC", "BRACO", "sonar"))
+    assert lab.exchange.accounts["radio"].fates["refused"] == 2
 
 
 async def test_what_is_said_for_others_is_not_logged_frame_by_frame(
@@ -453,6 +473,39 @@ async def test_a_link_or_a_far_end_that_goes_away_ends_the_calls_there_at_once(l
         assert await refused(call) == "link_down"
 
 
+async def test_a_command_that_waits_when_its_link_goes_down_is_told_why(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+    lab.far["radio"].full = True
+    call = asyncio.ensure_future(lab.call("MNERIM", "parafrente", 1))
+    await settled()
+    lab.links["radio"].lost(LinkLost("/dev/radio: unplugged"))
+    with pytest.raises(CallError, match=r"its link is down \(/dev/radio: unplugged\)"):
+        await call
+
+
+async def test_what_a_robot_told_of_itself_is_forgotten_with_it(labs: Labs) -> None:
+    lab = labs(words())
+    lab.know()
+
+    def commands() -> set[str]:
+        route = lab.router.find(MNERIM)
+        assert route is not None
+        return {command.name for command in lab.resident.commands(route)}
+
+    discovery = asyncio.ensure_future(lab.call("base", "discover", timeout_s=2))
+    await until(lambda: any("quantoscomandos" in line for line in said(lab.far["radio"])))
+    lab.hears("radio", wire("MNERIM", "base", "quantoscomandos", "1"))
+    await until(lambda: any("exibecomando" in line for line in said(lab.far["radio"])))
+    lab.hears("radio", wire("MNERIM", "base", "exibecomando", "dance", "0", "0", "0"))
+    await discovery
+    assert "dance" in commands()
+    lab.links["radio"].lost(LinkLost("unplugged"))
+    lab.connect("radio", MemoryTransport())
+    lab.know()
+    assert "dance" not in commands()
+
+
 async def test_a_put_does_not_end_a_call_and_its_answer_is_not_refused(labs: Labs) -> None:
     lab = labs(words())
     lab.know()
@@ -485,6 +538,15 @@ async def test_a_discovery_keeps_its_deadline_and_tells_who_is_known_by_then(lab
         begun = time.monotonic()
         assert (await lab.call("base", "discover", timeout_s=timeout_s)).values == ["MNERIM"]
         assert time.monotonic() - begun < timeout_s + 0.3
+
+
+async def test_a_discovery_without_a_deadline_has_one(labs: Labs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calling, "DISCOVERY_S", 0.1)
+    lab = labs(words())
+    lab.know()
+    begun = time.monotonic()
+    assert (await lab.call("base", "discover")).values == ["MNERIM"]
+    assert time.monotonic() - begun < 0.4
 
 
 async def test_a_discovery_asks_nobody_where_everyone_may_not_be_asked(labs: Labs) -> None:

@@ -28,7 +28,8 @@ class Decision:
 
     forward: to `hops`. flood: to `hops`, and the broker answers too. answer: it is for the broker.
     ask: unknown robot; hold the frame and ask for it on `hops`. translate: the robot speaks another
-    protocol; the broker asks it in the sender's stead. drop: for the reason `verdict`.
+    protocol; the broker asks it in the sender's stead, or tells the sender that it cannot, for the
+    reason `verdict`. drop: for the reason `verdict`.
     """
 
     action: Action
@@ -128,12 +129,12 @@ class Router:
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
+        translatable = (protocol, target.protocol) == ("psiu-ascii", "psiu-hexa") and target.way.link != MESH
         if target.way.link not in self.ports:
-            return Decision("drop", verdict=LINK_DOWN)
+            return Decision("translate" if translatable else "drop", verdict=LINK_DOWN)
         if target.way.link == MESH:
             return self._decide_by_mesh(target, arrived)
         if target.protocol != protocol:
-            translatable = (protocol, target.protocol) == ("psiu-ascii", "psiu-hexa")
             return Decision("translate") if translatable else Decision("drop", verdict=REFUSED)
         hops = tuple(way for way in self._ways_to(target) if way != arrived)
         if hops:

@@ -1,7 +1,7 @@
 import pytest
 
 from psiu_broker.frame import EVERYONE, Address, Frame, Way
-from psiu_broker.routing.router import SELF, Port, Router
+from psiu_broker.routing.router import SELF, Decision, Port, Router
 from psiu_broker.routing.table import Binding, Route, Table
 
 BASE, PC, MNERIM, BRACO = (Address.named(name) for name in ("base", "PC", "MNERIM", "BRACO"))
@@ -163,7 +163,8 @@ def test_a_robot_of_the_configuration_is_known_before_it_speaks(router: Router) 
 
 def test_when_its_link_is_down_a_robot_of_the_configuration_is_not_forgotten(router: Router) -> None:
     router.link_down("arm", 0.0)
-    assert router.decide(ARM_NUMBER, "psiu-hexa", LAPTOP).verdict == "link_down"
+    assert router.decide(ARM_NUMBER, "psiu-hexa", LAPTOP) == Decision("drop", verdict="link_down")
+    assert router.decide(BRACO, "psiu-ascii", PHONE) == Decision("translate", verdict="link_down")
     router.link_up(Port("arm", "psiu-hexa", lambda: (ARM,)))
     assert router.decide(ARM_NUMBER, "psiu-hexa", LAPTOP).hops == (ARM,)
 
