@@ -22,6 +22,9 @@ Values = Mapping[str, tuple[zenoh.Encoding, object]]
 TURNED_AWAY_MAX: Final = 4096
 """Queries that may wait to hear that there is no room; one more hears nothing."""
 
+SENT_S: Final = 3.0
+"""How long a broker that stops waits for programs to read their replies: several may be stuck, one after another."""
+
 _REFUSAL: Final = json_of("Refusal")
 
 
@@ -54,9 +57,9 @@ class Replies:
             refused.add_done_callback(lambda _: self._away_room.release())
 
     async def sent(self) -> None:
-        """Wait for what `answer` and `refuse` have on its way out."""
+        """Wait for what `answer` and `refuse` have on its way out, for at most `SENT_S`."""
         if self._pending:
-            await asyncio.wait([asyncio.wrap_future(reply) for reply in tuple(self._pending)])
+            await asyncio.wait([asyncio.wrap_future(reply) for reply in tuple(self._pending)], timeout=SENT_S)
 
     def _kept(self, reply: "Future[None]") -> "Future[None]":
         self._pending.add(reply)

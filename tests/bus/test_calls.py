@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psiu_broker.bus import calls as calls_module
+from psiu_broker.bus import replies as replies_module
 from psiu_broker.bus.calls import Calls, read_request
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.session import Session
@@ -315,6 +316,22 @@ async def test_an_answer_on_its_way_is_not_lost_when_the_broker_stops(
     await closing
     [answer] = await asked
     assert answer["status"] == "sucesso"
+
+
+async def test_askers_that_do_not_read_keep_no_broker_from_stopping(
+    calls: Calls, program: zenoh.Session, robots: Robots, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replies_module, "SENT_S", 0.01)
+    busy = threading.Event()
+    calls._replies._worker.submit(busy.wait)
+    asked = asyncio.create_task(ask(program, "psiu/@call/A/b"))
+    await until(lambda: calls._replies._pending)
+    try:
+        async with asyncio.timeout(5):
+            await calls.close()
+    finally:
+        busy.set()
+    await asked
 
 
 async def test_an_asker_that_gave_up_harms_nobody(
