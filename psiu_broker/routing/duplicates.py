@@ -41,7 +41,10 @@ class Duplicates:
         if seen is hearing:
             before = self._old.get(key)
             if before is not None and self._is_another(before, way, now):
-                new[key] = self._leading(before, way)
+                if before[0].link == MESH:
+                    new[key] = self._leading(before, way)
+                else:
+                    del new[key]
                 return True
             if len(new) >= self._capacity:
                 self._until = -inf
