@@ -25,6 +25,7 @@ from psiu_broker.routing.verdicts import (
     EXPIRED,
     MALFORMED,
     NO_ROUTE,
+    SAME_WAY,
     Account,
     Verdict,
 )
@@ -280,7 +281,8 @@ class Exchange:
     def expire(self, now: float) -> None:
         """Drop what has waited too long, here and in the outboxes, and the routes that grew too old."""
         for held in self.holding.expire(now):
-            self.settled(Fate(held.frame, held.arrived), NO_ROUTE, now)
+            decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
+            self.settled(Fate(held.frame, held.arrived), decision.verdict or NO_ROUTE, now)
         for link in self.links.values():
             link.expire(now)
         self.router.table.age(self._route_age_s, now)
@@ -327,6 +329,8 @@ class Exchange:
             case "ask":
                 return self._ask(frame, decision.hops, way, now)
             case "drop":
+                if decision.verdict is SAME_WAY and frame.subject in _SEARCHES:
+                    return self._look_elsewhere(frame, way, now)
                 return decision.verdict
 
     def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float) -> Verdict | None:
@@ -373,6 +377,11 @@ class Exchange:
             self._ask_on(robot, hops, now)
         return None
 
+    def _look_elsewhere(self, frame: Frame, way: Way, now: float) -> Verdict | None:
+        """A robot is searched for by the very way that leads to it: perhaps by a broker there that lost it."""
+        hops = self.router.elsewhere(frame.destination, frame.protocol, way)
+        return self._ask(frame, hops, way, now) if hops else SAME_WAY
+
     def _may_search(self, frame: Frame, now: float) -> bool:
         """Whether `frame` may have us ask for its destination; it may be another broker's search for the same."""
         return frame.subject not in _SEARCHES or self._searches.may(
@@ -388,6 +397,7 @@ class Exchange:
         account = self.accounts[SELF.link]
         for frame, asked in questions.items():
             self.resident.asked_names(asked, now)
+            self.router.sent(frame, now)
             account.arrived += 1
             if self.bus.listened:
                 self._publish(frame, tuple(asked), SELF)

@@ -198,6 +198,39 @@ def test_a_robot_that_does_not_answer_to_its_name_has_no_route(world: World) -> 
     world.balances()
 
 
+def test_a_robot_searched_for_by_the_way_that_leads_to_it_is_looked_for_elsewhere(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "parafrente", "sucesso"), None)
+    search = wire("relay", "MNERIM", "qualseunome")
+    world.links["radio"].received(search, None)
+    assert world.wires("second") == [wire("base", "MNERIM", "qualseunome")]
+    assert world.wires("radio") == []
+    world.links["second"].received(wire("MNERIM", "base", "qualseunome"), None)
+    assert world.wires("second")[1:] == [search]
+    world.balances()
+
+
+def test_where_it_is_nowhere_else_the_search_was_heard_by_the_robot_itself(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.links["radio"].received(wire("PC", "MNERIM", "qualseunome"), None)
+    world.links["radio"].received(wire("PC", "MNERIM", "parafrente", "1"), None)
+    world.exchange.expire(world.now + 1)
+    assert world.verdicts("radio") == {"answered": 1, "same_way": 2}
+    route = world.exchange.router.find(Address.named("MNERIM"))
+    assert route is not None
+    assert route.way == Way("radio")
+    world.balances()
+
+
+def test_when_a_radio_is_lost_the_same_order_by_another_is_no_double(world: World) -> None:
+    world.links["wifi"].received(wire("MNERIM", "base", "qualseunome"), PEERS[0])
+    order = wire("PC", "MNERIM", "parafrente", "1")
+    world.links["radio"].received(order, None)
+    world.now += 1
+    world.links["radio"].lost(LinkLost("unplugged"))
+    world.links["second"].received(order, None)
+    assert world.transports["wifi"].written == [(order, PEERS[0])] * 2
+
+
 def test_a_packet_for_an_unknown_number_waits_while_the_number_is_pinged() -> None:
     world = World()
     for name, domain in (("field", ""), ("yard", ""), ("theirs", "red")):

@@ -11,6 +11,7 @@ from memory_adapter import MemoryAdapter, MemoryTransport, codec_of, configurati
 from psiu_broker.adapter import Peer
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.codecs.identity import identity
+from psiu_broker.errors import LinkLost
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import Address, Frame, Malformed, Way
 from psiu_broker.link import Link
@@ -162,6 +163,29 @@ def test_a_person_who_presses_twice_is_obeyed_twice() -> None:
     ring.says("PC", "MNERIM", "parafrente", "100")
     ring.run(5)
     assert ring.heard["MNERIM"].count(command) == 2
+
+
+def test_a_neighbour_whose_way_led_through_us_finds_another_when_we_lost_ours() -> None:
+    ring = Ring((0.02, 0.02, 0.02))
+    ring.says("PC", "MNERIM", "parafrente", "1")
+    ring.run(5)
+    told = codec_of(configuration()).encode(psiu_ascii.message(Address.named("MNERIM"), Address.named("B"), "luz"))
+    ring.exchanges["B"].links["BC"].received(told, None)  # B heard MNERIM by C last
+    for broker in ("A", "C"):
+        ring.exchanges[broker].links["AC"].lost(LinkLost("cut"))
+    command = ring.says("PC", "MNERIM", "parafrente", "2")
+    ring.run(5)
+    assert ring.heard["MNERIM"].count(command) == 1
+    assert ring.silent()
+
+
+def test_what_comes_round_of_our_own_question_is_a_double() -> None:
+    ring = Ring((0.02, 0.02, 0.02))
+    exchange = ring.exchanges["A"]
+    exchange.ask_names(exchange.links["AB"], ring.now)
+    ring.run(5)
+    assert exchange.accounts["AC"].fates["duplicate"] == 1
+    assert exchange.accounts["AC"].fates["refused"] == 0
 
 
 def test_a_robot_that_nobody_has_heard_is_found_across_the_ring() -> None:

@@ -64,6 +64,13 @@ class Duplicates:
         """The way that leads from now on: a link of ours before another broker, however quick that was."""
         return (way, seen[1]) if seen[0].link == MESH else seen
 
+    def forget(self, link: str, now: float) -> None:
+        """`link` is gone: what it led may come by another way and be a repeat; only what is very new is a double."""
+        for generation in (self._new, self._old):
+            led = [key for key, (way, at) in generation.items() if way.link == link and now - at > self._same_link_s]
+            for key in led:
+                del generation[key]
+
     def _is_another(self, seen: tuple[Way, float], way: Way, now: float) -> bool:
         """Whether what was `seen` came by another way than `way`, and so lately that this is its double."""
         if seen[0] == way:

@@ -118,14 +118,17 @@ class Router:
                 return ready
         return self.decide(frame.destination, frame.protocol, arrived)
 
+    def sent(self, frame: Frame, now: float) -> None:
+        """A frame of our own left without being routed: what comes round of it is a double."""
+        self._duplicates.is_double(self._identity(frame), SELF, now)
+
     def decide(self, destination: Address, protocol: str, arrived: Way) -> Decision:
         """What `route` decides for a frame of `protocol` from `arrived`, doubles aside. Changes nothing."""
         if destination == EVERYONE:
             return Decision("flood", self._everyone(protocol, arrived))
         target = self._routes.get(destination)
         if target is None:
-            domain = destination.domain if destination.is_numbered else None
-            hops = self._everyone(protocol, arrived, domain)
+            hops = self.elsewhere(destination, protocol, arrived)
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
@@ -141,6 +144,13 @@ class Router:
             return Decision("forward", hops)
         return Decision("drop", verdict=SAME_WAY if target.way.link == arrived.link else LINK_DOWN)
 
+    def elsewhere(self, robot: Address, protocol: str, arrived: Way) -> tuple[Way, ...]:
+        """Where else than by the way that leads to it a robot may be asked for; nowhere, where its place is fixed."""
+        route = self._routes.get(robot)
+        if route is not None and (route.pinned or route.way != arrived):
+            return ()
+        return self._everyone(protocol, arrived, robot.domain if robot.is_numbered else None)
+
     def link_up(self, port: Port) -> None:
         self.ports[port.link] = port
         for route in self.table:
@@ -148,12 +158,13 @@ class Router:
                 self._refresh(route)
 
     def link_down(self, link: str, now: float) -> None:
-        """Withdraw what was learned on `link`."""
+        """Withdraw what was learned on `link`, and let another take its place at once."""
         self.ports.pop(link, None)
         for route in self.table:
             if route.way.link == link:
                 route.decision = None
         self.table.forget_link(link, now)
+        self._duplicates.forget(link, now)
 
     def peer_lost(self, way: Way, now: float) -> None:
         """Withdraw the routes over a far end that is gone."""

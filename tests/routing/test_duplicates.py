@@ -82,6 +82,18 @@ def test_a_full_memory_forgets_its_older_half_only() -> None:
     assert duplicates.is_double(100, WIFI, 0.5)
 
 
+def test_when_the_leading_link_is_gone_another_way_brings_repeats() -> None:
+    duplicates = Duplicates(4.0, same_link_s=0.25)
+    for generation, at in ((b"old", 0.0), (b"frame", 3.0), (b"new", 4.5), (b"just now", 4.9)):
+        duplicates.is_double(generation, RADIO, at)
+    duplicates.is_double(b"other", ARM, 4.5)
+    duplicates.forget("radio", 5.0)
+    assert not duplicates.is_double(b"frame", WIFI, 5.0)
+    assert not duplicates.is_double(b"new", WIFI, 5.0)
+    assert duplicates.is_double(b"just now", WIFI, 5.0), "its copy may have been on the way"
+    assert duplicates.is_double(b"other", WIFI, 5.0)
+
+
 def test_memory_is_bounded_under_a_flood_of_different_frames() -> None:
     duplicates = Duplicates(1.0, capacity=100)
     for number in range(10_000):
