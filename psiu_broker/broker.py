@@ -53,7 +53,8 @@ STOOD_STILL_S: Final = 1.0
 """A pause between ticks that is no mere load: the process was stopped, or the computer slept."""
 STALE_S: Final = 0.3
 """How long after that calls may still come that had waited meanwhile."""
-LOOK_AROUND_S: Final = 0.5
+LOOK_AROUND_S: Final = 2.0
+ALIVE_EVERY_S: Final = 0.25
 DOUBLES_MARGIN_S: Final = 2.0
 """A frame may wait its age limit in an outbox, and this long elsewhere, before its double is no longer known."""
 DRAIN_S: Final = 1.0
@@ -135,6 +136,8 @@ class Broker:
             create(self._look_around(), name="look around"),
             create(self._keep_bus(), name="bus"),
         ]
+        if self._last_alive is not None:
+            self._tasks.append(create(self._note_life(self._last_alive), name="last alive"))
         kept = (*self.exchange.links.values(), *self._trunks)
         self._link_tasks = [create(each.run(), name=f"{each.kind} {each.name}") for each in kept]
 
@@ -349,13 +352,16 @@ class Broker:
             await asyncio.sleep(TICK_S)
 
     async def _look_around(self) -> None:
-        """See whom Zenoh has a link to, and note that we live."""
+        """See whom Zenoh has a link to."""
         while True:
             if self._bus is not None:
                 await self._bus.mesh.look()
-            if self._last_alive is not None:
-                self._last_alive.note()
             await asyncio.sleep(LOOK_AROUND_S)
+
+    async def _note_life(self, alive: LastAlive) -> None:
+        while True:
+            alive.note()
+            await asyncio.sleep(ALIVE_EVERY_S)
 
     def _look_after(self, now: float) -> None:
         """Drop what is too late, and put the cards that changed."""

@@ -35,7 +35,6 @@ logger = logging.getLogger(__name__)
 
 RING: Final = 65_536
 TALK_RING: Final = 4096
-LINKED_EVERY_S: Final = 2.0
 NONE: Final = "-"
 
 PRIORITIES: Final[Mapping[int, Any]] = {
