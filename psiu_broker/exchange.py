@@ -179,10 +179,15 @@ class Exchange:
         return verdict
 
     def relayed(self, frame: Frame, way: Way, now: float, age_s: float) -> Verdict | None:
-        """A frame came from another broker `age_s` after its robot sent it; told to the bus there, not here."""
+        """A frame came from another broker `age_s` after its robot sent it.
+
+        It is told to the bus there, unless its robot is ours: then the other broker was the quicker one to hear it.
+        """
         account = self.accounts[MESH]
         account.arrived += 1
         decision = self.router.route(frame, way, now)
+        if self.bus.listened and decision is not DOUBLE and self.router.is_here(frame.source):
+            self._publish(frame, decision.hops, way)
         patience_s = min((self._max_age_s[hop.link] for hop in decision.hops), default=inf) - age_s
         verdict: Verdict | None
         if patience_s <= 0:

@@ -18,7 +18,7 @@ from psiu_broker.mesh.envelope import Envelope, pack, unpack
 from psiu_broker.mesh.neighbour import BEAT_S, SILENT_S, Neighbour, Neighbours
 from psiu_broker.routing.claims import Claim, age_of
 from psiu_broker.routing.outbox import Fate, lane
-from psiu_broker.routing.ownership import Overheard, Ownership
+from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.router import Router
 from psiu_broker.routing.table import Route
 from psiu_broker.routing.verdicts import DELIVERED, DUPLICATE, LINK_DOWN, MALFORMED, REFUSED, Verdict
@@ -39,17 +39,22 @@ STRANGERS_MAX: Final = 256
 FORMER_MAX: Final = 1024
 
 
-NOTHING: Final = digest(())
-
-
 class Tokens:
-    """The tokens of one broker that are declared now: for a moment two for one robot, while a claim is renewed."""
+    """The claims that one life of a broker has declared now: some twice for a moment, while all is declared anew."""
 
-    __slots__ = ("_claims", "_digest")
+    __slots__ = ("_claims", "_digest", "_round", "renewed")
 
     def __init__(self) -> None:
         self._claims: dict[Address, list[tuple[int, Claim]]] = {}
+        """With the round of asking in which they were declared, the oldest first."""
         self._digest: str | None = None
+        self._round = 0
+        self.renewed = False
+        """Since the last `ask`, the broker has declared itself anew, and so all its claims."""
+
+    def __iter__(self) -> Iterator[Claim]:
+        """The newest claim of each robot."""
+        return (held[-1][1] for held in self._claims.values())
 
     @property
     def digest(self) -> str:
@@ -57,20 +62,44 @@ class Tokens:
             self._digest = digest({claim for held in self._claims.values() for _, claim in held})
         return self._digest
 
-    def add(self, epoch: int, claim: Claim) -> None:
+    def add(self, claim: Claim) -> None:
         self._digest = None
-        self._claims.setdefault(claim.robot, []).append((epoch, claim))
+        self._claims.setdefault(claim.robot, []).append((self._round, claim))
 
-    def remove(self, epoch: int, claim: Claim) -> Claim | None:
+    def remove(self, claim: Claim) -> Claim | None:
         """The claim that the broker still has for the robot."""
         self._digest = None
         held = self._claims.get(claim.robot, [])
-        if (epoch, claim) in held:
-            held.remove((epoch, claim))
+        declared = next((each for each in held if each[1] == claim), None)
+        if declared is not None:
+            held.remove(declared)
         if not held:
             self._claims.pop(claim.robot, None)
             return None
         return held[-1][1]
+
+    def ask(self) -> None:
+        """The broker is asked to declare anew what it has."""
+        self._round += 1
+        self.renewed = False
+
+    def sweep(self) -> list[Address]:
+        """Forget what was not declared anew since we asked; of which robots."""
+        self._digest = None
+        self.renewed = False
+        changed = []
+        for robot, held in list(self._claims.items()):
+            kept = [each for each in held if each[0] == self._round]
+            if kept != held:
+                changed.append(robot)
+                self._claims[robot] = kept
+                if not kept:
+                    del self._claims[robot]
+        return changed
+
+    def find(self, robot: Address) -> Claim | None:
+        held = self._claims.get(robot)
+        return held[-1][1] if held else None
 
 
 class MeshBus(Protocol):
@@ -154,7 +183,8 @@ class Mesh:
         self._attached = False
         self._former: dict[tuple[str, int], Neighbour] = {}
         """Brokers that went, by name and life: if they were only out of sight, the series go on."""
-        self._tokens: dict[str, Tokens] = {}
+        self._tokens: dict[tuple[str, int], Tokens] = {}
+        """By broker and life, also of those that are not announced (yet, or any more)."""
         self._given: dict[Address, float] = {}
         self._orphans: dict[Address, tuple[str, float]] = {}
         """Robots that nobody owns any more: who did last, and until when."""
@@ -169,6 +199,7 @@ class Mesh:
         self._bus = bus
         self._attached = True
         self.epoch = secrets.randbits(64)
+        self._former.clear()
         self._anew_at = now
         bus.announce(self.epoch)
         self.tick(now)
@@ -220,6 +251,7 @@ class Mesh:
         if known is not None:
             if known.epoch == epoch:
                 known.editions.add(edition)
+                self._tokens_of(name, epoch).renewed = True
                 return
             self._lose(known, now)
         neighbour = self._former.pop((name, epoch), None)
@@ -229,7 +261,10 @@ class Mesh:
             neighbour.returned(now)
         neighbour.editions = {edition}
         self.neighbours.add(neighbour)
-        self._router.announced((Address.named(name),), neighbour.way, "psiu-ascii", now)
+        self._settle(Address.named(name), now)
+        for claim in self._tokens_of(name, epoch):
+            if self.claims.set(name, claim):
+                self._settle(claim.robot, now)
         self._hub.neighbour_came(name)
         self._beaten = -inf
         log.info("mesh: broker %s is there", name)
@@ -249,31 +284,26 @@ class Mesh:
         self._former[name, neighbour.epoch] = neighbour
         if len(self._former) > FORMER_MAX:
             del self._former[next(iter(self._former))]
-        self._tokens.pop(name, None)
-        self._router.peer_lost(neighbour.way, now)
         for robot in self.claims.remove_broker(name):
             self._orphans[robot] = name, now
             self._settle(robot, now)
+        self._router.peer_lost(neighbour.way, now)
         log.info("mesh: broker %s is gone", name)
 
     def claimed(self, broker: str, epoch: int, claim: Claim, now: float) -> None:
         if broker == self.own:
             return
-        self._tokens.setdefault(broker, Tokens()).add(epoch, claim)
-        if self.claims.set(broker, claim):
+        self._tokens_of(broker, epoch).add(claim)
+        if self._lives(broker, epoch) and self.claims.set(broker, claim):
             self._settle(claim.robot, now)
 
     def unclaimed(self, broker: str, epoch: int, claim: Claim, now: float) -> None:
         if broker == self.own:
             return
-        tokens = self._tokens.get(broker)
-        rest = None if tokens is None else tokens.remove(epoch, claim)
-        if rest is not None:
-            self.claims.set(broker, rest)
-        else:
-            self.claims.remove(broker, claim.robot)
-            self._orphans[claim.robot] = broker, now
-        self._settle(claim.robot, now)
+        tokens = self._tokens_of(broker, epoch)
+        tokens.remove(claim)
+        if self._lives(broker, epoch):
+            self._follow(broker, tokens, claim.robot, now)
 
     def frame_came(self, sender: str, urgency: int, data: bytes, now: float) -> None:
         envelope = unpack(data)
@@ -296,8 +326,7 @@ class Mesh:
             return
         self._strangers.pop(beat.broker, None)
         neighbour.beat(beat, self.own, now)
-        tokens = self._tokens.get(beat.broker)
-        if beat.claims == (tokens.digest if tokens is not None else NOTHING):
+        if beat.claims == self._tokens_of(beat.broker, beat.epoch).digest:
             neighbour.differs_since = None
         elif neighbour.differs_since is None:
             neighbour.differs_since = now
@@ -317,7 +346,9 @@ class Mesh:
         if route is None or self.claims.find(self.own, route.robot) is None:
             return
         better_by = notice.quality - self._quality(route.way.link)
-        if self.ownership.noticed(route, notice.broker, self._identity(envelope.frame), better_by, now):
+        heard_at = now - neighbour.late_s(envelope.sent_us, now) - (neighbour.round_trip_s or 0.0) / 2
+        key = self._identity(envelope.frame)
+        if self.ownership.noticed(route, notice.broker, key, better_by, heard_at, now):
             self._give(route, notice.broker, now)
 
     # What the broker tells us.
@@ -335,7 +366,7 @@ class Mesh:
             self._unclaim(claim)
 
     def notify(self, owner: str, frame: Frame, arrived: Way, now: float) -> None:
-        """Tell the owner of a robot that we heard this frame of it."""
+        """Tell the owner of a robot that we heard this frame of it at `now`."""
         neighbour = self.neighbours.find(owner)
         if neighbour is not None:
             try:
@@ -353,9 +384,14 @@ class Mesh:
             route = self._router.find(robot)
             if route is not None and self.claims.find(self.own, robot) is not None:
                 self._give(route, broker, now)
+        if not all(neighbour.alive(now) for neighbour in self.neighbours):
+            for robot in self.ownership.abandoned(now):
+                self._take(robot, now)
         if now - self._beaten >= BEAT_S:
             self._beaten = now
             self._beat(now)
+            for owner, frame, way, heard_at in list(self.ownership.reminders(now)):
+                self.notify(owner, frame, way, heard_at)
             self._set_right(now)
             self._guard(now)
 
@@ -381,12 +417,13 @@ class Mesh:
 
     def _settle(self, robot: Address, now: float) -> None:
         """Bring the route to `robot` in line with who claims it."""
+        namesake = self.neighbours.find(str(robot))
+        if namesake is not None:  # a robot cannot be a broker
+            self._router.announced((robot,), namesake.way, "psiu-ascii", now)
+            return
         held = self.claims.owner(robot)
         if held is None:
-            overheard = self.ownership.recent(robot, now)
-            if overheard is not None:
-                self._router.take(robot, overheard.way, overheard.protocol, now)
-            elif robot not in self._given:
+            if not self._take(robot, now) and robot not in self._given:
                 self._router.unannounced(robot, now)
             return
         owner, claim = held
@@ -397,10 +434,40 @@ class Mesh:
         mine = self.claims.find(self.own, robot)
         if mine is not None:
             self._unclaim(mine)
-            self._remember(self._router.find(robot), now)
+            self._remember(self._router.find(robot))
         neighbour = self.neighbours.find(owner)
         if neighbour is not None:
-            self._router.announced(claim.addresses, neighbour.way, claim.protocol, now)
+            heard = claim.age_s is not None
+            self._router.announced(claim.addresses, neighbour.way, claim.protocol, now, heard=heard)
+
+    def _take(self, robot: Address, now: float) -> bool:
+        """Take a robot that we overheard of late."""
+        known = self.ownership.recent(robot, now)
+        self.ownership.overheard.pop(robot, None)
+        return known is not None and self._router.take(robot, known.way, known.protocol, known.at)
+
+    def _follow(self, broker: str, tokens: Tokens, robot: Address, now: float) -> None:
+        """Bring what the broker claims of `robot` in line with its tokens."""
+        claim = tokens.find(robot)
+        if claim is None:
+            self.claims.remove(broker, robot)
+            self._orphans[robot] = broker, now
+        else:
+            self.claims.set(broker, claim)
+        self._settle(robot, now)
+
+    def _lives(self, broker: str, epoch: int) -> bool:
+        neighbour = self.neighbours.find(broker)
+        return neighbour is not None and neighbour.epoch == epoch
+
+    def _tokens_of(self, broker: str, epoch: int) -> Tokens:
+        tokens = self._tokens.get((broker, epoch))
+        if tokens is None:
+            if len(self._tokens) >= FORMER_MAX:
+                gone = (each for each in self._tokens if not self._lives(*each))
+                self._tokens.pop(next(gone, (broker, epoch)), None)
+            tokens = self._tokens[broker, epoch] = Tokens()
+        return tokens
 
     def _give(self, route: Route, broker: str, now: float) -> None:
         """Give up a robot that moved to another broker, which takes it when it sees that."""
@@ -411,14 +478,14 @@ class Mesh:
             return
         log.info("mesh: %s goes to %s", robot, broker)
         self._unclaim(mine)
-        self._remember(route, now)
+        self._remember(route)
         self._given[robot] = now
         self._router.announced(route.addresses, neighbour.way, route.protocol, now)
 
-    def _remember(self, route: Route | None, now: float) -> None:
+    def _remember(self, route: Route | None) -> None:
         """What was ours a moment ago, so that it can be again."""
-        if route is not None and route.way.link != MESH and route.heard_at is not None:
-            self.ownership.overheard[route.robot] = Overheard(route.way, route.protocol, route.heard_at, now)
+        if route is not None and route.way.link != MESH:
+            self.ownership.remember(route)
 
     def _announce(self, route: Route, now: float, *, news: bool = False) -> None:
         """Claim a robot of one of our links, or renew the claim where it has changed."""
@@ -428,7 +495,7 @@ class Mesh:
         if not self._attached or robot in self._given:
             return
         taken = held is not None and held[0] != self.own
-        if taken and not news and not self._heard_since_lost(route, now):
+        if taken and not news:
             return
         heard = route.heard_at is not None
         term = mine.term if mine is not None and (mine.term > 0 or not heard) else 0
@@ -447,13 +514,6 @@ class Mesh:
         if mine is not None:
             self._bus.withdraw(mine)
 
-    def _heard_since_lost(self, route: Route, now: float) -> bool:
-        """Whether a robot that the configuration keeps here, and another broker claims, was heard here after all."""
-        if route.heard_at is None or now - route.heard_at > 2 * BEAT_S:
-            return False
-        known = self.ownership.overheard.get(route.robot)
-        return known is None or route.heard_at > known.at
-
     def _unclaim(self, claim: Claim) -> None:
         self.claims.remove(self.own, claim.robot)
         self._bus.withdraw(claim)
@@ -465,9 +525,15 @@ class Mesh:
             if now - since > GIVEN_S:
                 del self._given[robot]
                 self._settle(robot, now)
+        owners = {robot: broker for broker, claim in self.claims if (robot := claim.robot) not in self._given}
+        owners |= {Address.named(neighbour.name): neighbour.name for neighbour in self.neighbours}
+        for robot, owner in owners.items():
+            found = self._router.find(robot)
+            if owner != self.own and (found is None or found.way.peer != owner or found.way.link != MESH):
+                self._settle(robot, now)
         for route in list(self._router.table):
             if route.way.link == MESH:
-                if self.neighbours.find(str(route.robot)) is None and route.robot not in self._given:
+                if route.robot not in owners and route.robot not in self._given:
                     self._settle(route.robot, now)
             elif route.way.link in self._router.ports:
                 self._announce(route, now)
@@ -495,12 +561,22 @@ class Mesh:
             elif neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
                 self._declare_anew(now, f"{neighbour.name} does not hear us")
             if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
-                self._ask_anew(neighbour.name)
                 neighbour.differs_since = now
+                self._differs(neighbour, now)
         for name, since in list(self._strangers.items()):
             if now - since > SILENT_S:
                 del self._strangers[name]
                 self._ask_anew(name)
+
+    def _differs(self, neighbour: Neighbour, now: float) -> None:
+        """We have missed a token of a broker, or that one was withdrawn."""
+        tokens = self._tokens_of(neighbour.name, neighbour.epoch)
+        if tokens.renewed:
+            for robot in tokens.sweep():
+                self._follow(neighbour.name, tokens, robot, now)
+        else:
+            tokens.ask()
+            self._ask_anew(neighbour.name)
 
     def _stranger(self, name: str, now: float) -> None:
         """A beat of a broker that is not announced to us."""

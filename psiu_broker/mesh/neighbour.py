@@ -9,7 +9,7 @@ from psiu_broker.mesh.beat import Beat
 from psiu_broker.routing.sequence import Sequence
 
 BEAT_S: Final = 0.4
-ALIVE_S: Final = 1.2
+ALIVE_S: Final = 0.9
 """A broker whose last beat is older may be gone: its robots are anybody's who hears them."""
 SILENT_S: Final = 2.2
 """A broker that is announced and yet so long silent does not know of us: we declare everything anew."""
@@ -68,6 +68,7 @@ class Neighbour:
         """It was only out of sight, and the series of frames go on."""
         self.since = now
         self.beat_at = self.deaf_since = self.differs_since = None
+        self._offsets.clear()  # its clock stands still while it sleeps
 
     def beat(self, beat: Beat, own: str, now: float) -> None:
         """Note a beat that came now."""

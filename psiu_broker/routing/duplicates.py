@@ -55,10 +55,10 @@ class Duplicates:
             new[key] = hearing
         return False
 
-    def heard_here(self, key: Hashable) -> bool:
-        """Whether a link of ours, and not only another broker, brought the frame `key`."""
+    def heard_here(self, key: Hashable, since: float) -> bool:
+        """Whether a link of ours, and not only another broker, brought the frame `key` at `since` or later."""
         seen = self._new.get(key) or self._old.get(key)
-        return seen is not None and seen[0].link != MESH
+        return seen is not None and seen[0].link != MESH and seen[1] >= since
 
     def _leading(self, seen: tuple[Way, float], way: Way) -> tuple[Way, float]:
         """The way that leads from now on: a link of ours before another broker, however quick that was."""

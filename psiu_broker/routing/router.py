@@ -170,7 +170,7 @@ class Router:
         """Withdraw the routes over a far end that is gone."""
         self.table.forget_way(way, now)
         for route in self.table:
-            if route.way.link == way.link:
+            if route.way.link == way.link or (route.pinned and route.way.link in self.ports):
                 self._refresh(route)
 
     def find(self, address: Address) -> Route | None:
@@ -180,16 +180,28 @@ class Router:
         """Every robot on a link of this broker."""
         return [route for route in self.table if route.way.link not in (SELF.link, MESH)]
 
+    def is_here(self, robot: Address) -> bool:
+        """Whether the robot is on a link of ours."""
+        route = self._routes.get(robot)
+        return route is not None and route.way.link not in (SELF.link, MESH)
+
     def is_elsewhere(self, robot: Address) -> bool:
         """Whether another broker has the robot."""
         route = self._routes.get(robot)
         return route is not None and route.way.link == MESH
 
-    def announced(self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float) -> None:
-        """Another broker, which `way` leads to, has the robot; what the configuration says of it here goes before."""
+    def announced(
+        self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float, *, heard: bool = True
+    ) -> None:
+        """Another broker, which `way` leads to, has the robot.
+
+        What the configuration says of it here goes before, unless the robot was `heard` there.
+        """
         before = self._routes.get(addresses[0])
         way_before = None if before is None else before.way
-        route = self.table.place(addresses, way, protocol, now)
+        if way_before == SELF:
+            return
+        route = self.table.place(addresses, way, protocol, now, heard=heard)
         if route is not None:
             self._refresh(route)
             if route is not before or way_before != way:
@@ -198,16 +210,23 @@ class Router:
     def unannounced(self, robot: Address, now: float) -> None:
         """No other broker has the robot any more."""
         route = self._routes.get(robot)
-        if route is not None and route.way.link == MESH:
+        if route is not None and route.way.link == MESH and route.robot == robot:
             self.table.withdraw(route, now)
-
-    def take(self, robot: Address, way: Way, protocol: str, now: float) -> None:
-        """The robot, of which another broker was the owner, is on a link of ours, where it was overheard."""
-        if way.link in self.ports:
-            route = self.table.learn(robot, way, protocol, now)
-            if route is not None:
+            if route.pinned:
                 self._refresh(route)
                 self._heard(route)
+
+    def take(self, robot: Address, way: Way, protocol: str, heard_at: float) -> bool:
+        """The robot, of which another broker was the owner, is on a link of ours, where it was overheard.
+
+        False if it cannot be there any more.
+        """
+        route = self.table.learn(robot, way, protocol, heard_at) if way.link in self.ports else None
+        if route is None:
+            return False
+        self._refresh(route)
+        self._heard(route)
+        return True
 
     def _learn(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> bool:
         """Take note of the sender; False if it cannot be who it says."""
@@ -229,7 +248,8 @@ class Router:
 
     def _takes(self, source: Route, frame: Frame, arrived: Way, now: float) -> bool:
         """Whether a robot of another broker, heard here, is ours from now on."""
-        return self._ownership is None or self._ownership.takes(source, frame, arrived, now)
+        ownership = self._ownership
+        return source.may_be_on(arrived) and (ownership is None or ownership.takes(source, frame, arrived, now))
 
     def _note_double(self, frame: Frame, arrived: Way, now: float) -> Decision:
         """A double goes nowhere, and yet its robot was heard on the link that brought it."""
@@ -237,7 +257,7 @@ class Router:
         if source is not None and arrived.link not in (MESH, SELF.link):
             if source.way == arrived:
                 source.heard_at = now
-            elif source.way.link == MESH and self._ownership is not None:
+            elif source.way.link == MESH and self._ownership is not None and source.may_be_on(arrived):
                 self._ownership.overhear(source, frame, arrived, now)
         return DOUBLE
 

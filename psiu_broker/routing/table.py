@@ -31,7 +31,7 @@ class Route:
         """Where the configuration says the robot is; its peer there may be learned."""
         self.protocol = protocol
         self.pinned = pinned
-        """True for a route of the configuration: it neither ages nor moves to another link."""
+        """True for a route of the configuration: it neither ages nor moves to another link of this broker."""
         self.decision: Any = None
         """What the router answers for a frame in the robot's own protocol, while its link is up."""
         self.first_heard: float | None = None
@@ -41,6 +41,11 @@ class Route:
     @property
     def robot(self) -> Address:
         return self.addresses[0]
+
+    def may_be_on(self, way: Way) -> bool:
+        """Whether the configuration lets the robot be heard on `way`."""
+        home = self.home
+        return not self.pinned or way == home or (home.peer is None and way.link == home.link)
 
 
 class Departed(NamedTuple):
@@ -85,7 +90,7 @@ class Table:
             route = Route((address,), way, protocol, pinned=False)
             self._enter(route)
             self._departed.pop(address, None)
-        elif route.pinned and way != route.home and (route.home.peer is not None or way.link != route.home.link):
+        elif not route.may_be_on(way):
             return None
         route.way = way
         route.protocol = protocol
@@ -95,13 +100,20 @@ class Table:
             route.first_heard = now
         return route
 
-    def place(self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float) -> Route | None:
-        """Note where another broker says that a robot is; None where the configuration keeps it here."""
-        free = tuple(each for each in addresses if not self._is_pinned(each))
-        if addresses[0] not in free:
+    def place(
+        self, addresses: tuple[Address, ...], way: Way, protocol: str, now: float, *, heard: bool = True
+    ) -> Route | None:
+        """Note where another broker says that a robot is.
+
+        A robot of the configuration follows only if it was `heard` there. None where it does not, and for a bare
+        number that is known to be a robot with a name.
+        """
+        robot = addresses[0]
+        route = self.routes.get(robot)
+        if route is not None and (route.robot != robot or (route.pinned and not heard)):
             return None
-        route = self.routes.get(addresses[0])
-        if route is None or route.addresses != free:
+        free = (robot, *(number for number in addresses[1:] if self._may_join(number, robot)))
+        if route is None or (not route.pinned and route.addresses != free):
             self._withdraw(list({id(old): old for each in free if (old := self.routes.get(each))}.values()), now)
             self._make_room(now)
             route = Route(free, way, protocol, pinned=False)
@@ -109,13 +121,13 @@ class Table:
         route.way = way
         route.protocol = protocol
         route.heard_at = None
-        for address in free:
+        for address in route.addresses:
             self._departed.pop(address, None)
         return route
 
     def withdraw(self, route: Route, now: float) -> None:
-        """Give up a learned route."""
-        self._withdraw([route], now)
+        """Give up a route; that of a robot of the configuration leads back to where it says."""
+        self._forget([route], now)
 
     def forget_link(self, link: str, now: float) -> None:
         """Withdraw what was learned on `link`; pinned routes stay, to say that their link is down."""
@@ -139,9 +151,10 @@ class Table:
     def departed(self, address: Address) -> Departed | None:
         return self._departed.get(address)
 
-    def _is_pinned(self, address: Address) -> bool:
-        route = self.routes.get(address)
-        return route is not None and route.pinned
+    def _may_join(self, number: Address, robot: Address) -> bool:
+        """Whether `number` is free for the robot: nobody's, its own, or that of a robot not known by name before."""
+        route = self.routes.get(number)
+        return route is None or route.robot in (robot, number)
 
     def _make_room(self, now: float) -> None:
         if len(self.routes) >= self._capacity:
@@ -154,6 +167,8 @@ class Table:
     def _forget(self, routes: list[Route], now: float) -> None:
         for route in routes:
             if route.pinned:
+                if route.way.link != route.home.link:
+                    route.heard_at = None
                 route.way = route.home
         self._withdraw([route for route in routes if not route.pinned], now)
 
