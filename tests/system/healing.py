@@ -151,7 +151,7 @@ class _Books:
                 faults.append(f"{name} does not answer")
                 continue
             if not ledger["balances"] or ledger["total"]["waiting"]:
-                faults.append(f"the ledger of {name} does not balance: {ledger['total']}")
+                faults.append(f"the ledger of {name} does not balance: {ledger['accounts']}")
             told = {robot["robot"]: robot["owner"] for robot in mesh["robots"] if robot["robot"] in owners}
             if told != owners:
                 faults.append(f"{name} says that the robots are with {told}")
