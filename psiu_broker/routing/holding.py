@@ -63,7 +63,8 @@ class Holding:
             late = [held for held in frames if held.since + self._hold_s <= now]
             if late:
                 expired += late
-                frames[:] = frames[len(late) :]
+                # Not just the first: one from another broker is as old as it was when it came.
+                frames[:] = [held for held in frames if held.since + self._hold_s > now]
             if not frames:
                 del self._held[destination]
                 self._asked.pop(destination, None)

@@ -30,6 +30,14 @@ def test_a_frame_is_held_only_briefly() -> None:
     assert holding.waiting_from("radio") == 0
 
 
+def test_a_frame_that_was_old_when_it_came_goes_before_those_that_came_before_it() -> None:
+    holding = Holding(0.5)
+    holding.add(frame("MNERIM", b"new"), RADIO, 0.4)
+    holding.add(frame("MNERIM", b"old"), Way("@mesh", "other"), 0.1)
+    assert [held.frame.payload for held in holding.expire(0.6)] == [b"old"]
+    assert [held.frame.payload for held in holding.expire(0.9)] == [b"new"]
+
+
 def test_a_robot_is_asked_for_again_while_frames_for_it_keep_coming() -> None:
     holding = Holding(0.5)
     asked = []
