@@ -32,6 +32,8 @@ POLL_S = 1.0
 EMPTY_S = 0.1
 BAUD_TOLERANCE = 0.03
 TCGETS2 = 0x802C542A
+UNSENT_MAX = 4096
+"""Bytes that the kernel holds back for a slow network port: by default megabytes, and an urgent frame behind them."""
 USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})(?::(.+))?")
 BARE_NAME = re.compile(r"/dev/tty(USB|ACM)\d+")
 PARITY = {
@@ -184,6 +186,7 @@ class Serial(Adapter):
         if self.scheme == "socket":
             with socket.socket(fileno=os.dup(port.fileno())) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_MAX)
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         if not path:
             return

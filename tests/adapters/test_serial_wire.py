@@ -4,6 +4,7 @@ import asyncio
 import fcntl
 import os
 import select
+import socket
 import threading
 import time
 from pathlib import Path
@@ -155,6 +156,21 @@ class TestUrls:
         ends[0].close()
         server.close()
         await server.wait_closed()
+
+    async def test_a_network_port_that_does_not_read_is_given_little(self, recorder: Recorder) -> None:
+        with socket.socket() as server:
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            server.bind(("127.0.0.1", 0))
+            server.listen()
+            transport = await Serial(device=f"socket://127.0.0.1:{server.getsockname()[1]}").open(recorder)
+            far, _ = server.accept()
+            taken = 0
+            while transport.write(bytes(1000), None):
+                taken += 1
+                assert taken < 64, "an urgent frame would wait behind all that"
+            assert len(far.recv(2000)) == 2000
+            far.close()
+            await transport.close()
 
     async def test_a_server_that_is_not_there_is_waited_for(self, recorder: Recorder) -> None:
         for scheme in ("socket", "rfc2217"):
