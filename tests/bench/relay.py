@@ -362,7 +362,7 @@ async def delays_s(folder: Path) -> list[float]:
 
 HEADS: Final = ("in the line", "robots'", "own", "passed on", "answers", "doubles", "unasked")
 ABOUT: Final = f"""\
-Three brokers in a ring of {BAUD}-baud lines, MNERIM on a line of one, PC on one of another; {MINUTES} minutes.
+Brokers A, B and C in a simulated ring of {BAUD}-baud lines, MNERIM on a line of A, PC on one of C; {MINUTES} minutes.
 Shown is the direction of a line with most questions of the broker's own, in % of the bit rate. Passed on: questions
 of other brokers; answers: names said to brokers. Of the whole ring: frames dropped as doubles, and questions that
 brokers left unasked, to stay within their allowance.
