@@ -180,4 +180,4 @@ class Configuration:
     robots: Mapping[str, RobotConfiguration]
     warnings: tuple[str, ...] = ()
     trunks: Mapping[str, TrunkConfiguration] = field(default_factory=dict)
-    mesh: MeshConfiguration = MeshConfiguration()
+    mesh: MeshConfiguration = field(default_factory=MeshConfiguration)
