@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import sys
+import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -40,20 +41,22 @@ class BrokerProcess:
     async def running(self, **environment: str) -> AsyncIterator[asyncio.subprocess.Process]:
         """Ends as told, unless the test has killed it."""
         command = (str(Path(sys.executable).parent / "psiu-broker"), "run", "--config", str(self.file))
-        process = await asyncio.create_subprocess_exec(
-            *command, env={**os.environ, **environment}, stderr=asyncio.subprocess.PIPE
-        )
-        assert process.stderr is not None
-        try:
-            async with asyncio.timeout(20):
-                while b"is ready" not in await process.stderr.readline():
-                    pass
-            yield process
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()
-            await process.communicate()
-        assert process.returncode in (0, -signal.SIGKILL)
+        with tempfile.TemporaryDirectory(prefix="psiu-") as temporary:
+            process = await asyncio.create_subprocess_exec(
+                *command, env={**os.environ, "TMPDIR": temporary, **environment}, stderr=asyncio.subprocess.PIPE
+            )
+            assert process.stderr is not None
+            try:
+                async with asyncio.timeout(20):
+                    while b"is ready" not in await process.stderr.readline():
+                        pass
+                yield process
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    process.terminate()
+                await process.communicate()
+            assert process.returncode in (0, -signal.SIGKILL)
+            assert process.returncode or os.listdir(temporary) == [], "it leaves nothing behind"  # noqa: PTH208
 
     async def asked(self, what: str) -> dict[str, Any]:
         """What the brokers that a program at this one reaches say, by their names."""
