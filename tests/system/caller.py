@@ -2,7 +2,7 @@
 
 It reads requests from stdin, one JSON object a line, and writes an answer to each to stdout as it comes:
 
-    {"id": 1, "call": ["BETA2", "marca", "n17"], "timeout_s": 0.5}  ->  {"id": 1, "answer": ["n17"]}
+    {"id": 1, "call": ["BETA2", "marca", "call17"], "timeout_s": 0.5}  ->  {"id": 1, "answer": ["call17"]}
     {"id": 2, "ask": ["base", "mesh"]}                              ->  {"id": 2, "answer": {...}}
 
 or ``{"id": 1, "error": "..."}``. It ends with its stdin.

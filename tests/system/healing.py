@@ -42,12 +42,10 @@ class Watch:
         self._books: _Books | None = None
         self._doubles: set[str] = set()
 
-    async def start(self) -> list[str]:
-        """Wait until everyone reaches everyone for the first time; what is wrong, in words."""
+    async def start(self) -> Healed:
+        """Wait until everyone reaches everyone for the first time, then until the books agree."""
         self._traffic.go()
-        faults, _ = await self._heal("the start", time.monotonic(), START_S)
-        await self._traffic.pause()
-        return [*faults, *await self._settle(), *self._new_doubles()]
+        return await self._after("the start", time.monotonic(), START_S, [])
 
     async def stop(self) -> None:
         await self._traffic.pause()
@@ -64,13 +62,16 @@ class Watch:
         ended = time.monotonic()
         self._lab.note(f"is over: {event.text}")
         self._traffic.go()
-        late, healed_at = await self._heal("after it the mesh", ended, HEALED_S)
+        return await self._after(event.text, ended, HEALED_S, faults)
+
+    async def _after(self, text: str, since: float, within_s: float, faults: list[str]) -> Healed:
+        late, healed_at = await self._heal("after it the mesh", since, within_s)
         self._lab.note("healed" if healed_at else "not healed")
         await self._traffic.pause()
-        faults += [*late, *await self._settle()]
-        sent, doubles = self._traffic.sent(ended, healed_at or time.monotonic()), self._new_doubles()
-        healed_s = None if healed_at is None else healed_at - ended
-        return Healed(event.text, healed_s, sent, len(doubles), (*faults, *doubles))
+        unsettled = await self._settle()
+        sent, doubles = self._traffic.sent(since, healed_at or time.monotonic()), self._new_doubles()
+        healed_s = None if healed_at is None else healed_at - since
+        return Healed(text, healed_s, sent, len(doubles), (*faults, *late, *unsettled, *doubles))
 
     async def _meanwhile(self, event: Event, begun: float) -> list[str]:
         """Stay until the event has lasted; a long one until the others have found each other too."""

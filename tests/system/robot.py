@@ -12,7 +12,7 @@ from psiu_broker.codecs.psiu_ascii import PsiuAscii
 from psiu_broker.frame import EVERYONE, Address, Frame
 
 ORDER = "marca"
-"""The command word of all orders; ``marca n17`` is answered with ``marca sucesso n17``."""
+"""The command word of all orders; ``marca order17`` is answered with ``marca sucesso order17``."""
 DONE = "sucesso"
 
 

@@ -46,20 +46,21 @@ async def test_after_whatever_befalls_it_the_mesh_heals_within_five_seconds(topo
         async with Lab(cables, topology.mode, tmp_path) as lab:
             watch = Watch(lab)
             try:
-                faults = [f"at the start: {fault}" for fault in await watch.start()]
+                start = await watch.start()
+                _tell(topology, 0, start)
                 for number, draw in enumerate(events.drawn(EVENTS, chance), 1):
-                    if faults and not healed:
+                    if (healed or [start])[-1].healed_s is None:
                         break
-                    healed.append(one := await watch.go_through(draw(lab, chance)))
-                    faults += [f"event {number}, {one.text}: {fault}" for fault in one.faults]
-                    took = "never healed" if one.healed_s is None else f"healed in {one.healed_s:.2f} s"
-                    print(
-                        f"{topology.name} {number}: {one.text}; {took}; {one.sent.lost} lost", *one.faults, sep="\n  "
-                    )
-                    if one.healed_s is None:
-                        break
+                    healed.append(await watch.go_through(draw(lab, chance)))
+                    _tell(topology, number, healed[-1])
             finally:
                 await watch.stop()
     print(figures(topology.name, healed))
+    faults = [f"{number}, {one.text}: {fault}" for number, one in enumerate([start, *healed]) for fault in one.faults]
     report = "\n".join(faults)
     assert not faults, f"{topology.name}, PSIU_MESH_SEED={SEED}, logs in {tmp_path}:\n{report}"
+
+
+def _tell(topology: Topology, number: int, one: Healed) -> None:
+    took = "never healed" if one.healed_s is None else f"healed in {one.healed_s:.2f} s"
+    print(f"{topology.name} {number}: {one.text}; {took}; {one.sent.lost} lost", *one.faults, sep="\n  ", flush=True)

@@ -95,7 +95,7 @@ class Traffic:
         """The orders and answers that some robot got more than once, in words."""
         found: list[str] = []
         for robot in self._lab.robots:
-            for what, words in (("order", robot.obeyed), ("answer", robot.answers)):
+            for what, words in (("command", robot.obeyed), ("answer", robot.answers)):
                 found += [
                     f"{robot.name} got the {what} {word} {len(times)} times, {times[-1] - times[0]:.3f} s apart"
                     for word, times in words.items()
@@ -138,8 +138,8 @@ class Traffic:
                     await self._early.wait()
 
     def _begin(self) -> None:
-        words = {pair: f"n{next(self._numbers)}" for pair in self.pairs}
-        calls = {pair: f"n{next(self._numbers)}" for pair in self.pairs}
+        words = {pair: f"order{next(self._numbers)}" for pair in self.pairs}
+        calls = {pair: f"call{next(self._numbers)}" for pair in self.pairs}
         round_ = Round(time.monotonic(), words, calls)
         self._rounds.append(round_)
         for (a, b), word in words.items():
