@@ -64,14 +64,20 @@ class Session:
 
     def put_frame(self, to: str, lane: int, data: bytes) -> None:
         name = self._name
-        self._simulation.send("frame", name, to, lambda it: it.mesh.frame_came(name, lane, data, it.now))
+        self._simulation.send(
+            "frame", name, to, lambda it: it.dispatch(lambda: it.mesh.frame_came(name, lane, data, it.now))
+        )
 
     def put_beat(self, beat: Beat) -> None:
         for to in self._simulation.others(self._name):
-            self._simulation.send("beat", self._name, to, lambda it: it.mesh.beat_came(beat, it.now))
+            self._simulation.send(
+                "beat", self._name, to, lambda it: it.dispatch(lambda: it.mesh.beat_came(beat, it.now))
+            )
 
     def put_notice(self, to: str, notice: Notice) -> None:
-        self._simulation.send("notice", self._name, to, lambda it: it.mesh.notice_came(notice, it.now))
+        self._simulation.send(
+            "notice", self._name, to, lambda it: it.dispatch(lambda: it.mesh.notice_came(notice, it.now))
+        )
 
     def announce(self, epoch: int) -> None:
         self._epoch = epoch
@@ -178,23 +184,30 @@ class Station:
         self.mesh.tick(self.now)
 
     def told(self, kind: str, token: Token) -> None:
-        """The network tells of a token, once each way."""
-        new = (token in self.seen) is (kind == "untoken")
-        if not new:
+        """The network tells of a token, once each way; the broker hears of it when it is not stopped."""
+        if (token in self.seen) is (kind == "token"):
             return
         name, epoch, zenoh_id, edition, claim = token
+        mesh = self.mesh
         if kind == "token":
             self.seen.add(token)
             if claim is None:
-                self.mesh.broker_came(name, epoch, zenoh_id, str(edition), self.now)
+                self.dispatch(lambda: mesh.broker_came(name, epoch, zenoh_id, str(edition), self.now))
             else:
-                self.mesh.claimed(name, epoch, claim, self.now)
+                self.dispatch(lambda: mesh.claimed(name, epoch, claim, self.now))
         else:
             self.seen.remove(token)
             if claim is None:
-                self.mesh.broker_went(name, epoch, str(edition), self.now)
+                self.dispatch(lambda: mesh.broker_went(name, epoch, str(edition), self.now))
             else:
-                self.mesh.unclaimed(name, epoch, claim, self.now)
+                self.dispatch(lambda: mesh.unclaimed(name, epoch, claim, self.now))
+
+    def dispatch(self, event: Callable[[], None]) -> None:
+        """Have it happen, once the broker is not stopped."""
+        if self.stopped:
+            self.waiting.append(event)
+        else:
+            event()
 
     # The router's and the ownership's ears, as in Broker.
 
@@ -362,7 +375,8 @@ class Simulation:
         data = wire(robot, to, *words)
         for name in at:
             if name in self.stations:
-                self.dispatch(name, lambda it: it.exchange.links[link].received(data, None))
+                station = self.stations[name]
+                station.dispatch(lambda station=station: station.exchange.links[link].received(data, None))  # type: ignore[misc]
         return data
 
     def talks(self, robot: str, at: Iterable[str], seconds: float, every_s: float = 0.2, to: str = "PC") -> list[bytes]:
@@ -484,7 +498,7 @@ class Simulation:
 
         def arrive() -> None:
             if self.reach(sender, to) and self.stations.get(to) is station:
-                self.dispatch(to, deliver)
+                deliver(station)
 
         self.after(at - self.now, arrive)
 
@@ -497,14 +511,6 @@ class Simulation:
                     self.after(LEASE_S, lambda other=other: self._reconcile(other, token.broker))  # type: ignore[misc]
             else:
                 self.send(kind, token.broker, other, lambda it: it.told(kind, token))
-
-    def dispatch(self, name: str, event: Callable[[Station], None]) -> None:
-        """Have it happen to the broker, once it is not stopped."""
-        station = self.stations[name]
-        if station.stopped:
-            station.waiting.append(lambda: event(station))
-        else:
-            event(station)
 
     def _tick_later(self, station: Station, seconds: float) -> None:
         def tick() -> None:
@@ -538,10 +544,10 @@ class Simulation:
         seen = {token for token in station.seen if token.broker == owner}
         for token in sorted(stands - seen, key=_presence_first):
             if not self.loses("token", owner, observer):
-                self.dispatch(observer, lambda it, token=token: it.told("token", token))  # type: ignore[misc]
+                station.told("token", token)
         for token in sorted(seen - stands, key=_presence_first):
-            self.dispatch(observer, lambda it, token=token: it.told("untoken", token))  # type: ignore[misc]
+            station.told("untoken", token)
 
 
 def _presence_first(token: Token) -> tuple[bool, str]:
-    return token.claim is not None, repr(token)
+    return token.claim is not None, repr(token.claim)
