@@ -394,7 +394,7 @@ async def test_the_status_counts_what_the_bus_did(lab: Lab) -> None:
 
 
 async def test_a_call_that_came_while_the_broker_stood_still_moves_nothing(lab: Lab) -> None:
-    time.sleep(broker_module.STOOD_STILL_S + 0.1)  # the loop stands still, as under SIGSTOP
+    time.sleep(broker_module.STOOD_STILL_S + 0.1)  # noqa: ASYNC251 - the loop stands still, as under SIGSTOP
     for _ in range(2):  # before the clock's next tick, and after it
         with pytest.raises(CallError) as raised:
             await lab.call("MNERIM", "parafrente", 1)
