@@ -434,7 +434,7 @@ class Mesh:
         mine = self.claims.find(self.own, robot)
         if mine is not None:
             self._unclaim(mine)
-            self._remember(self._router.find(robot))
+        self.ownership.forget(robot)
         neighbour = self.neighbours.find(owner)
         if neighbour is not None:
             heard = claim.age_s is not None
@@ -478,14 +478,9 @@ class Mesh:
             return
         log.info("mesh: %s goes to %s", robot, broker)
         self._unclaim(mine)
-        self._remember(route)
+        self.ownership.remember(route)
         self._given[robot] = now
         self._router.announced(route.addresses, neighbour.way, route.protocol, now)
-
-    def _remember(self, route: Route | None) -> None:
-        """What was ours a moment ago, so that it can be again."""
-        if route is not None and route.way.link != MESH:
-            self.ownership.remember(route)
 
     def _announce(self, route: Route, now: float, *, news: bool = False) -> None:
         """Claim a robot of one of our links, or renew the claim where it has changed."""

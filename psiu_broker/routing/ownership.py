@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.frame import MESH, Address, Frame, Way
 from psiu_broker.routing.claims import Claims
 from psiu_broker.routing.table import Route
 
@@ -141,9 +141,15 @@ class Ownership:
         self._note(robot, Overheard(arrived, frame.protocol, now, frame, noticed_at))
 
     def remember(self, route: Route) -> None:
-        """Note a robot that was ours until now, so that it can be again."""
-        if route.heard_at is not None:
+        """Note a robot that we give up, so that it can be ours again should nobody take it."""
+        if route.heard_at is not None and route.way.link != MESH:
             self._note(route.robot, Overheard(route.way, route.protocol, route.heard_at))
+
+    def forget(self, robot: Address) -> None:
+        """Somebody has taken it: of where we had it nothing is left, only of where we overheard it since."""
+        known = self.overheard.get(robot)
+        if known is not None and known.frame is None:
+            del self.overheard[robot]
 
     def reminders(self, now: float) -> Iterator[tuple[str, Frame, Way, float]]:
         """What is to be told to an owner once more: the owner, the frame, where and when we heard it."""

@@ -174,6 +174,15 @@ def test_where_it_was_does_not_keep_frames_from_where_it_is(mesh: Simulation) ->
     assert mesh.stations["B"].antennas[RADIO].wires.count(command) == 1
 
 
+def test_a_robot_that_moved_and_vanished_there_is_not_thought_to_be_where_it_was(mesh: Simulation) -> None:
+    mesh.says("MNERIM", "B", "PC", "cheguei")
+    mesh.run(1)
+    mesh.stations["B"].unplug(RADIO)
+    mesh.run(3)
+    assert mesh.owner("MNERIM") is None
+    assert mesh.stations["A"].route("MNERIM") is None
+
+
 def test_two_brokers_that_hear_the_robot_arrive_do_not_both_keep_it(mesh: Simulation) -> None:
     mesh.start("D")
     mesh.run(1)
