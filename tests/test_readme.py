@@ -14,7 +14,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from psiu_broker.cli import daemon, tool
 from psiu_broker.codecs import CODECS
-from psiu_broker.config import BrokerConfiguration, LinkOptions, ZenohConfiguration, load
+from psiu_broker.config import BrokerConfiguration, LinkOptions, MeshConfiguration, ZenohConfiguration, load
 from psiu_broker.config.tables import RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
@@ -27,10 +27,12 @@ PORTUGUESE = (TREE / "README.pt-BR.md").read_text()
 READMES = pytest.mark.parametrize("readme", [ENGLISH, PORTUGUESE], ids=["en", "pt-BR"])
 GROUPS: dict[str, click.Group] = {"psiu": tool.psiu, "psiu-broker": daemon.psiu_broker}
 
+MANY_BROKERS = re.compile(r"^## (?:Many|Muitos) brokers\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MODELS: dict[str, type[BaseModel]] = {
     "[broker]": BrokerConfiguration,
     "[zenoh]": ZenohConfiguration,
+    "[mesh]": MeshConfiguration,
     "[links.NAME]": LinkOptions,
     "[robots.NAME]": RobotTable,
     "nodes.NAME": Node,
@@ -89,8 +91,13 @@ def test_both_languages_have_the_same_sections_examples_and_tables() -> None:
 
 @READMES
 def test_ten_minutes_of_reading(readme: str) -> None:
-    words = [word for word in prose(readme).split() if re.search(r"\w", word)]
-    assert len(words) <= 2300
+    [many] = MANY_BROKERS.findall(readme)
+    assert _words(readme) - _words(many) <= 2300
+    assert _words(many) <= 650
+
+
+def _words(text: str) -> int:
+    return sum(bool(re.search(r"\w", word)) for word in prose(text).split())
 
 
 @READMES
@@ -104,6 +111,17 @@ def test_the_configurations_load(readme: str, tmp_path: Path) -> None:
         assert configuration.broker.name == "base"
     assert set(configuration.links) == {"radio", "wifi", "arm"}
     assert configuration.robots["BRACO"].nodes["garra"].type == "servo"
+
+
+@READMES
+def test_the_tables_for_many_brokers_load(readme: str, tmp_path: Path) -> None:
+    tables = [block for block in blocks(readme, "toml") if re.match(r"\[(?:zenoh|mesh|trunks)\b", block)]
+    file = tmp_path / "broker.toml"
+    file.write_text("\n".join(['[broker]\nname = "base"', *tables]))
+    configuration = load(file)
+    assert configuration.mesh.connect
+    assert set(configuration.trunks) == {"base"}
+    assert "**`[trunks.NAME]`**" in readme
 
 
 @READMES
@@ -196,5 +214,6 @@ def test_files_and_make_targets_exist(readme: str) -> None:
     for path in re.findall(r"^(\S+/\S+)\s{2,}", "\n".join(blocks(readme, "text")), re.MULTILINE):
         assert (TREE / path).exists(), path
     makefile = (TREE / "Makefile").read_text()
-    for target in re.findall(r"make ([a-z]+)", "\n".join([*code(readme), *blocks(readme, "sh")])):
+    written = [*code(readme), *blocks(readme, "sh"), *blocks(readme, "text")]
+    for target in re.findall(r"make ([a-z-]+)", "\n".join(written)):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
