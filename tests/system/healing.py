@@ -20,6 +20,7 @@ NEVER_S: Final = 20.0
 """How long one that is late is watched, for the report."""
 START_S: Final = 20.0
 POLL_S: Final = 0.05
+DOUBLES_SHOWN: Final = 8
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,10 @@ class Watch:
         unsettled = await self._settle()
         sent, doubles = self._traffic.sent(since, healed_at or time.monotonic()), self._new_doubles()
         healed_s = None if healed_at is None else healed_at - since
-        return Healed(text, healed_s, sent, len(doubles), (*faults, *late, *unsettled, *doubles))
+        shown = doubles[:DOUBLES_SHOWN]
+        if len(doubles) > len(shown):
+            shown.append(f"and {len(doubles) - len(shown)} more that came more than once")
+        return Healed(text, healed_s, sent, len(doubles), (*faults, *late, *unsettled, *shown))
 
     async def _meanwhile(self, event: Event, begun: float) -> list[str]:
         """Stay until the event has lasted; a long one until the others have found each other too."""
