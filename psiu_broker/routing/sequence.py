@@ -29,9 +29,8 @@ class Sequence:
             self._seen = (self._seen << ahead | 1) & ((1 << WINDOW) - 1) if ahead < WINDOW else 1
             self._newest = number
         else:
-            bit = 1 << -ahead
-            if -ahead >= WINDOW or number < 1 or self._seen & bit:
+            if ahead <= -WINDOW or number < 1 or self._seen >> -ahead & 1:
                 return False
-            self._seen |= bit
+            self._seen |= 1 << -ahead
         self.received += 1
         return True
