@@ -5,13 +5,14 @@ BIN := .venv/bin
 EXTRAS := test,lint,bluetooth-simulator,hotplug
 CANDIDATES := $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 
-.PHONY: help demo test bench mesh-proof lint clean
+.PHONY: help demo test bench mesh-proof mesh-scale lint clean
 
 help:
 	@echo "make demo    a broker and three simulated robots, for a look"
 	@echo "make test    all tests"
 	@echo "make bench   the figures of the README"
 	@echo "make mesh-proof   how the mesh heals, as root: EVENTS=100 a network, SEED=1"
+	@echo "make mesh-scale   how the mesh grows from 5 to 50 brokers, simulated"
 	@echo "make lint    ruff, mypy, the import rules"
 	@echo "make clean   remove what was set up"
 
@@ -27,6 +28,9 @@ bench: .venv/.ready
 mesh-proof: .venv/.ready
 	@PSIU_MESH_EVENTS=$(or $(EVENTS),100) PSIU_MESH_SEED=$(or $(SEED),$$(date +%s)) \
 	    $(BIN)/pytest tests/system/test_mesh_chaos.py -q -s $(PYTEST_ARGS)
+
+mesh-scale: .venv/.ready
+	@$(BIN)/python -m tests.bench.mesh_scale
 
 lint: .venv/.ready
 	$(BIN)/ruff check

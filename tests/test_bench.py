@@ -24,3 +24,11 @@ def test_the_bench_prints_all_figures_and_nothing_is_lost() -> None:
         "Latency at 1 kHz",
     ):
         assert line in bench.stdout
+
+
+def test_the_growth_of_the_mesh_is_printed() -> None:
+    command = [sys.executable, "-m", "tests.bench.mesh_scale", "--quick"]
+    bench = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert bench.returncode == 0, bench.stdout + bench.stderr
+    assert "How the mesh grows" in bench.stdout
+    assert "4 brokers: beats (N-1)/0.4 s = 7.5 msg/s" in bench.stdout

@@ -10,8 +10,11 @@ from typing import Final, NamedTuple
 
 from psiu_broker.frame import Address
 
-AGES_S: Final = (0, 5, 30, 120)
-"""A claim says how long ago its robot was heard no finer than this, so that a robot that talks changes nothing."""
+AGES_S: Final = (0, 30, 120)
+"""A claim says how long ago its robot was heard no finer than this, so that a robot that talks changes nothing.
+
+Each change is a token to every broker: with a step of 5 s, 1000 robots that talk every 7 s made 560 a second at each.
+"""
 
 BEST: Final = 10
 """The quality of a link on which every frame checked out."""

@@ -69,6 +69,7 @@ class Session:
         )
 
     def put_beat(self, beat: Beat) -> None:
+        self._simulation.beat = beat
         for to in self._simulation.others(self._name):
             self._simulation.send(
                 "beat", self._name, to, lambda it: it.dispatch(lambda: it.mesh.beat_came(beat, it.now))
@@ -286,6 +287,9 @@ class Simulation:
         self.delay_of: dict[str, float] = {}
         """By kind of message, where it is not `delay_s`."""
         self.sent: Counter[str] = Counter()
+        """Messages by their kind, once for each broker that they go to."""
+        self.beat: Beat | None = None
+        """The last one."""
         self.stations: dict[str, Station] = {}
         self.former: list[Station] = []
         self.bindings = bindings or {}
