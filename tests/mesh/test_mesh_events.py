@@ -44,7 +44,7 @@ class Storm:
         self.commands: list[bytes] = []
         self._words = count(1)
 
-    def happen(self, event: tuple, pause_s: float) -> None:  # type: ignore[type-arg]
+    def happen(self, event: tuple, pause_s: float) -> None:  # type: ignore[type-arg]  # noqa: PLR0912
         mesh = self.mesh
         up = {name for name, station in mesh.stations.items() if not station.stopped}
         match event:
