@@ -1,4 +1,4 @@
-from psiu_broker.frame import Way
+from psiu_broker.frame import MESH, Way
 from psiu_broker.routing.duplicates import Duplicates
 
 RADIO, WIFI, ARM = Way("radio"), Way("wifi", ("127.0.0.1", 9001)), Way("arm")
@@ -99,3 +99,38 @@ def test_memory_is_bounded_under_a_flood_of_different_frames() -> None:
     for number in range(10_000):
         duplicates.is_double(number, RADIO, 0.0)
     assert len(duplicates._new) + len(duplicates._old) <= 200
+
+
+BROKER = Way(MESH, "B")
+
+
+def test_what_a_link_of_ours_brought_is_known_with_its_time() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.heard_here(b"frame", -1e9)
+    duplicates.is_double(b"frame", RADIO, 10.0)
+    assert duplicates.heard_here(b"frame", 10.0)
+    assert not duplicates.heard_here(b"frame", 10.1)
+    duplicates.is_double(b"frame", RADIO, 10.5)
+    assert duplicates.heard_here(b"frame", 10.4), "said again"
+
+
+def test_what_only_another_broker_brought_was_not_heard_here() -> None:
+    duplicates = Duplicates(1.0)
+    duplicates.is_double(b"frame", BROKER, 10.0)
+    assert not duplicates.heard_here(b"frame", 0.0)
+
+
+def test_a_link_of_ours_leads_before_another_broker_however_quick_that_was() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", BROKER, 10.0)
+    assert duplicates.is_double(b"frame", RADIO, 10.1)
+    assert duplicates.heard_here(b"frame", 10.0)
+    assert not duplicates.is_double(b"frame", RADIO, 10.5), "the robot says it again, and our radio leads"
+    assert duplicates.is_double(b"frame", BROKER, 10.6)
+
+
+def test_of_two_links_of_ours_the_quicker_one_goes_on_leading() -> None:
+    duplicates = Duplicates(1.0)
+    assert not duplicates.is_double(b"frame", RADIO, 10.0)
+    assert duplicates.is_double(b"frame", ARM, 10.1)
+    assert duplicates.is_double(b"frame", ARM, 10.2)

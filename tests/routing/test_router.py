@@ -1,7 +1,7 @@
 import pytest
 
-from psiu_broker.frame import EVERYONE, Address, Frame, Way
-from psiu_broker.routing.router import SELF, Decision, Port, Router
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
+from psiu_broker.routing.router import ANY, SELF, Decision, Port, Router
 from psiu_broker.routing.table import Binding, Route, Table
 
 BASE, PC, MNERIM, BRACO = (Address.named(name) for name in ("base", "PC", "MNERIM", "BRACO"))
@@ -233,3 +233,206 @@ def test_deciding_changes_nothing(router: Router) -> None:
     router.decide(MNERIM, "psiu-ascii", PHONE)
     router.decide(EVERYONE, "psiu-ascii", PHONE)
     assert {address: route.way for address, route in router.table.routes.items()} == before
+
+
+# Other brokers.
+
+NORTH, SOUTH = Way(MESH, "north"), Way(MESH, "south")
+
+
+class Owners:
+    """Says of robots that live elsewhere what the test says."""
+
+    def __init__(self) -> None:
+        self.taken = False
+        self.overheard: list[Address] = []
+        self.radio: dict[Address, str] = {}
+
+    def takes(self, route: Route, frame: Frame, arrived: Way, now: float) -> bool:
+        return self.taken
+
+    def overhear(self, route: Route, frame: Frame, arrived: Way, now: float) -> None:
+        self.overheard.append(route.robot)
+
+    def heard_on(self, robot: Address) -> str | None:
+        return self.radio.get(robot)
+
+
+@pytest.fixture
+def owners() -> Owners:
+    return Owners()
+
+
+@pytest.fixture
+def joined(heard: list[Route], gone: list[Route], owners: Owners) -> Router:
+    """A broker with two radios and an arm, and two other brokers."""
+    router = Router(
+        {BASE: "psiu-ascii"},
+        (Binding(BRACO, ARM_NUMBER, ARM, "psiu-ascii"),),
+        identity=wire,
+        heard=heard.append,
+        withdrawn=gone.append,
+        ownership=owners,  # type: ignore[arg-type]
+    )
+    for way in (RADIO, ARM, Way("second")):
+        router.link_up(Port(way.link, "psiu-ascii", lambda way=way: (way,)))  # type: ignore[misc]
+    router.link_up(Port(MESH, ANY, lambda: (NORTH, SOUTH)))
+    router.announced((MNERIM,), NORTH, "psiu-ascii", 0.0)
+    return router
+
+
+def test_a_frame_for_a_robot_of_another_broker_goes_to_that_broker(joined: Router) -> None:
+    assert joined.route(text(PC, MNERIM), RADIO, 1.0).hops == (NORTH,)
+    assert joined.is_elsewhere(MNERIM)
+    assert not joined.is_here(MNERIM)
+
+
+def test_nothing_goes_from_one_broker_to_the_next(joined: Router) -> None:
+    assert joined.route(text(PC, MNERIM), SOUTH, 1.0).verdict == "same_way"
+    assert joined.route(text(PC, MNERIM, serial=1), NORTH, 1.0).verdict == "same_way"
+    assert {way.link for way in joined.decide(EVERYONE, "psiu-ascii", SOUTH).hops} == {"radio", "second", "arm"}
+    assert {way.link for way in joined.decide(Address.named("GHOST"), "psiu-ascii", SOUTH).hops} == {
+        "radio",
+        "second",
+        "arm",
+    }
+
+
+def test_a_question_to_everyone_goes_to_every_broker_and_every_other_link(joined: Router) -> None:
+    assert set(joined.decide(EVERYONE, "psiu-ascii", RADIO).hops) == {Way("second"), ARM, NORTH, SOUTH}
+
+
+def test_a_frame_on_the_radio_on_which_its_robot_was_overheard_has_reached_it(joined: Router, owners: Owners) -> None:
+    owners.radio[MNERIM] = "radio"
+    assert joined.decide(MNERIM, "psiu-ascii", RADIO).verdict == "same_way"
+    assert joined.decide(MNERIM, "psiu-ascii", Way("second")).hops == (NORTH,)
+
+
+def test_what_another_broker_relays_teaches_nothing(joined: Router) -> None:
+    joined.route(text(PC, BASE), SOUTH, 1.0)
+    assert joined.find(PC) is None
+
+
+def test_a_robot_of_another_broker_that_is_heard_here_stays_there_until_it_is_ours(
+    joined: Router, owners: Owners, heard: list[Route]
+) -> None:
+    joined.route(text(MNERIM, BASE), RADIO, 1.0)
+    assert joined.is_elsewhere(MNERIM)
+    owners.taken = True
+    heard.clear()
+    joined.route(text(MNERIM, BASE, serial=1), RADIO, 2.0)
+    assert joined.is_here(MNERIM)
+    assert [route.robot for route in heard] == [MNERIM]
+
+
+def test_a_double_of_a_robot_of_another_broker_is_overheard_all_the_same(joined: Router, owners: Owners) -> None:
+    joined.route(text(MNERIM, BASE), NORTH, 1.0)
+    assert joined.route(text(MNERIM, BASE), RADIO, 1.1).verdict == "duplicate"
+    assert owners.overheard == [MNERIM]
+
+
+def test_a_robot_that_other_brokers_announce_in_turn_is_one_robot(
+    joined: Router, heard: list[Route], gone: list[Route]
+) -> None:
+    heard.clear()
+    joined.announced((MNERIM,), NORTH, "psiu-ascii", 1.0)
+    assert heard == [], "that is no news"
+    joined.announced((MNERIM,), SOUTH, "psiu-ascii", 2.0)
+    assert joined.decide(MNERIM, "psiu-ascii", RADIO).hops == (SOUTH,)
+    assert [route.robot for route in heard] == [MNERIM]
+    assert gone == []
+    joined.unannounced(MNERIM, 3.0)
+    assert joined.find(MNERIM) is None
+    assert [route.robot for route in gone] == [MNERIM]
+
+
+def test_a_robot_of_ours_is_not_withdrawn_because_no_other_broker_has_it(joined: Router) -> None:
+    joined.route(text(PC, BASE), RADIO, 1.0)
+    joined.unannounced(PC, 2.0)
+    assert joined.is_here(PC)
+
+
+def test_a_robot_is_taken_where_it_was_overheard_unless_that_link_is_down(joined: Router) -> None:
+    joined.link_down("second", 1.0)
+    assert not joined.take(MNERIM, Way("second"), "psiu-ascii", 2.0)
+    assert joined.is_elsewhere(MNERIM)
+    assert joined.take(MNERIM, RADIO, "psiu-ascii", 2.0)
+    route = joined.find(MNERIM)
+    assert route is not None
+    assert (route.way, route.heard_at) == (RADIO, 2.0)
+
+
+def test_a_configured_robot_stays_though_another_broker_has_it_in_its_configuration_too(joined: Router) -> None:
+    joined.announced((BRACO,), NORTH, "psiu-ascii", 1.0, heard=False)
+    assert joined.decide(BRACO, "psiu-ascii", RADIO).hops == (ARM,)
+
+
+def test_a_configured_robot_follows_to_the_broker_that_hears_it_and_comes_home(
+    joined: Router, heard: list[Route], gone: list[Route]
+) -> None:
+    joined.announced((BRACO, ARM_NUMBER), NORTH, "psiu-ascii", 1.0)
+    assert joined.decide(BRACO, "psiu-ascii", RADIO).hops == (NORTH,)
+    assert joined.find(ARM_NUMBER) is joined.find(BRACO)
+    heard.clear()
+    joined.unannounced(BRACO, 2.0)
+    assert joined.decide(BRACO, "psiu-ascii", RADIO).hops == (ARM,)
+    assert [route.robot for route in heard] == [BRACO], "its card is ours again"
+    joined.announced((BRACO,), NORTH, "psiu-ascii", 3.0)
+    joined.peer_lost(NORTH, 4.0)
+    assert joined.decide(BRACO, "psiu-ascii", RADIO).hops == (ARM,)
+    assert BRACO not in [route.robot for route in gone]
+
+
+def test_a_configured_robot_is_taken_on_its_own_link_only(joined: Router, owners: Owners) -> None:
+    joined.announced((BRACO,), NORTH, "psiu-ascii", 1.0)
+    owners.taken = True
+    joined.route(text(BRACO, BASE), RADIO, 2.0)
+    assert joined.is_elsewhere(BRACO)
+    joined.route(text(BRACO, BASE, serial=1), ARM, 3.0)
+    assert joined.is_here(BRACO)
+
+
+def test_nobody_can_announce_a_robot_with_our_name(joined: Router) -> None:
+    joined.announced((BASE,), NORTH, "psiu-ascii", 1.0)
+    assert joined.decide(BASE, "psiu-ascii", RADIO).action == "answer"
+
+
+# Table.place: robots with a name and a number.
+
+NINE = Address.numbered(9)
+
+
+def addresses(table: Table) -> set[tuple[Address, ...]]:
+    return {route.addresses for route in table}
+
+
+def test_a_placed_robot_is_found_by_its_name_and_its_number() -> None:
+    table = Table()
+    route = table.place((MNERIM, NINE), NORTH, "psiu-hexa", 0.0)
+    assert table.routes == {MNERIM: route, NINE: route}
+
+
+def test_a_bare_number_gets_its_name_when_that_is_known_and_does_not_lose_it_again() -> None:
+    gone: list[Route] = []
+    table = Table(withdrawn=gone.append)
+    table.learn(NINE, RADIO, "psiu-hexa", 0.0)
+    table.place((MNERIM, NINE), NORTH, "psiu-hexa", 1.0)
+    assert addresses(table) == {(MNERIM, NINE)}
+    assert [route.robot for route in gone] == [NINE]
+    assert table.place((NINE,), SOUTH, "psiu-hexa", 2.0) is None
+    assert addresses(table) == {(MNERIM, NINE)}
+
+
+def test_a_number_that_two_names_claim_stays_with_the_first() -> None:
+    table = Table()
+    table.place((MNERIM, NINE), NORTH, "psiu-hexa", 0.0)
+    table.place((PC, NINE), SOUTH, "psiu-hexa", 1.0)
+    table.place((MNERIM, NINE), NORTH, "psiu-hexa", 2.0)
+    assert addresses(table) == {(MNERIM, NINE), (PC,)}
+
+
+def test_a_number_of_the_configuration_stays_with_the_robot_that_has_it_there() -> None:
+    table = Table((Binding(BRACO, ARM_NUMBER, ARM, "psiu-hexa"),))
+    table.place((MNERIM, ARM_NUMBER), NORTH, "psiu-hexa", 0.0)
+    assert table.place((ARM_NUMBER,), NORTH, "psiu-hexa", 0.0) is None
+    assert addresses(table) == {(BRACO, ARM_NUMBER), (MNERIM,)}
