@@ -23,6 +23,7 @@ from typing import Any, Final
 import zenoh
 from pydantic import ValidationError
 
+from psiu_broker.bus.hang_up import hang_up
 from psiu_broker.bus.keys import Keys, chunk, robot, robot_chunk, text
 from psiu_broker.bus.session import JSON, Declared, Session, aside, plain
 from psiu_broker.frame import Address
@@ -126,6 +127,9 @@ class ZenohMesh:
             self._later(self._declare_tokens_anew)
             self._anew = asyncio.get_running_loop().create_task(self._session.declare_anew())
 
+    def hang_up(self, zenoh_id: str | None) -> None:
+        self._later(self._end_links, zenoh_id)
+
     async def look(self) -> None:
         """Renew `linked`."""
 
@@ -177,6 +181,14 @@ class ZenohMesh:
             self._declare(key)
         for token in old.values():
             token.undeclare()
+
+    def _end_links(self, zenoh_id: str | None) -> None:
+        links = [
+            (str(link.src), str(link.dst))
+            for link in self._session.zenoh.info.links()
+            if zenoh_id in (None, str(link.zid))
+        ]
+        logger.info("mesh: %d connections ended", hang_up(links))
 
     def _key(self, claim: Claim) -> str:
         number = NONE if claim.number is None else robot_chunk(claim.number)

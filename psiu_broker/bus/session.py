@@ -259,9 +259,12 @@ def _configuration(listen: Sequence[str], connect: Sequence[str], mode: Mode, di
         },
         "scouting": {
             "delay": 0,
-            "multicast": {"enabled": discover, "autoconnect": {mode: [mode]}},
-            # Peers tell each other of those that they are connected to: one endpoint that all know is enough.
-            "gossip": {"enabled": mode == "peer", "autoconnect": {"peer": ["peer"]}},
+            "multicast": {
+                "enabled": discover,
+                "autoconnect": {mode: [mode]},
+                "autoconnect_strategy": {mode: {f"to_{mode}": "greater-zid"}},  # one of two connects, not both
+            },
+            "gossip": {"enabled": False},  # it connects brokers once more that are connected already
         },
         "transport": {
             "shared_memory": {"enabled": False},

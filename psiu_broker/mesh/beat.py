@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 Micros = Annotated[int, Field(ge=0, lt=2**63)]
+Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Beat(BaseModel):
@@ -17,10 +18,13 @@ class Beat(BaseModel):
     broker: str = Field(min_length=1, max_length=255)
     epoch: int = Field(ge=0, lt=2**64, description="which life of the broker this is")
     sent_us: Micros = Field(description="by the sender's clock")
-    heard: dict[str, tuple[Micros, Micros]] = Field(
-        default={},
+    heard: dict[str, tuple[Micros, Micros]] | None = Field(
+        default=None,
         max_length=4096,
-        description="for each broker the `sent_us` of its last beat, and how long ago that came",
+        description="for each broker the `sent_us` of its last beat, and how long ago that came; not in every beat",
+    )
+    sent: dict[str, dict[int, Count]] = Field(
+        default={}, max_length=4096, description="how many frames each broker was sent, by lane; not in every beat"
     )
     claims: str = Field(default="", max_length=64, description="the digest of what the sender claims")
 

@@ -7,7 +7,7 @@ again, because Zenoh itself relays between brokers. What is known comes from ann
 
 import logging
 import secrets
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator
 from math import inf
 from typing import Final, Protocol
 
@@ -32,6 +32,11 @@ GIVEN_S: Final = 1.0
 ORPHANED_S: Final = 1.0
 """How long a robot whose broker is gone may be without an owner before its card is deleted."""
 ANEW_EVERY_S: Final = 3.0
+HANG_UP_EVERY_S: Final = 3.0
+ASLEEP_S: Final = 1.0
+"""A pause between our own beats that is no mere load: then it is we who were not there."""
+FULL_EVERY: Final = 4
+"""Every so many beats one says what was heard from everybody; the others are short."""
 DIFFERS_S: Final = 2.0
 NAMESAKE_S: Final = 3.0
 """A broker of our name that is announced for longer than this is no former life of ours."""
@@ -106,6 +111,8 @@ class MeshBus(Protocol):
     """What the mesh needs of the bus. None of these waits or raises."""
 
     zenoh_id: str
+    linked: Collection[str]
+    """The Zenoh ids of those to whom a link of ours leads."""
 
     def put_frame(self, to: str, lane: int, data: bytes) -> None: ...
     def put_beat(self, beat: Beat) -> None: ...
@@ -118,11 +125,15 @@ class MeshBus(Protocol):
     def declare_anew(self) -> None:
         """Declare everything once more, for brokers that have lost sight of it."""
 
+    def hang_up(self, zenoh_id: str | None) -> None:
+        """End the links to a broker, or to all, so that they begin anew."""
+
 
 class _NoBus:
     """In the bus's place while there is none."""
 
     zenoh_id = ""
+    linked: Collection[str] = ()
 
     def put_frame(self, to: str, lane: int, data: bytes) -> None: ...
     def put_beat(self, beat: Beat) -> None: ...
@@ -131,6 +142,7 @@ class _NoBus:
     def claim(self, claim: Claim) -> None: ...
     def withdraw(self, claim: Claim) -> None: ...
     def declare_anew(self) -> None: ...
+    def hang_up(self, zenoh_id: str | None) -> None: ...
 
 
 class Hub(Protocol):
@@ -189,7 +201,9 @@ class Mesh:
         self._orphans: dict[Address, tuple[str, float]] = {}
         """Robots that nobody owns any more: who did last, and until when."""
         self._strangers: dict[str, float] = {}
+        self._beats = 0
         self._beaten = -inf
+        self._awake_since = -inf
         self._anew_at = -inf
 
     # The bus comes and goes.
@@ -388,6 +402,8 @@ class Mesh:
             for robot in self.ownership.abandoned(now):
                 self._take(robot, now)
         if now - self._beaten >= BEAT_S:
+            if now - self._beaten > ASLEEP_S:
+                self._awake_since = now
             self._beaten = now
             self._beat(now)
             for owner, frame, way, heard_at in list(self.ownership.reminders(now)):
@@ -411,9 +427,18 @@ class Mesh:
         return pack(Envelope(self.epoch, neighbour.epoch, number, int(now * 1e6), age_ms, frame))
 
     def _beat(self, now: float) -> None:
-        heard = {each.name: echo for each in self.neighbours if (echo := each.echo(now)) is not None}
-        claims = digest(self.claims.of(self.own).values())
-        self._bus.put_beat(Beat(broker=self.own, epoch=self.epoch, sent_us=int(now * 1e6), heard=heard, claims=claims))
+        self._beats += 1
+        beat = Beat(
+            broker=self.own,
+            epoch=self.epoch,
+            sent_us=int(now * 1e6),
+            claims=digest(self.claims.of(self.own).values()),
+        )
+        if self._beats % FULL_EVERY == 0:
+            heard = {each.name: echo for each in self.neighbours if (echo := each.echo(now)) is not None}
+            sent = {each.name: each.sent for each in self.neighbours if each.sent}
+            beat = beat.model_copy(update={"heard": heard, "sent": sent})
+        self._bus.put_beat(beat)
 
     def _settle(self, robot: Address, now: float) -> None:
         """Bring the route to `robot` in line with who claims it."""
@@ -549,10 +574,10 @@ class Mesh:
                     self._hub.orphaned(robot)
 
     def _guard(self, now: float) -> None:
-        """Notice who has lost sight of us, or we of them: Zenoh's routers do, and do not mend it."""
+        """Notice who has lost sight of us, or we of them: Zenoh does, and does not always mend it."""
         for neighbour in self.neighbours:
-            if now - neighbour.last_sign() > SILENT_S:
-                self._declare_anew(now, f"{neighbour.name} is announced and silent")
+            if now - max(neighbour.last_sign(), self._awake_since) > SILENT_S:
+                self._lost_sight(neighbour, now)
             elif neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
                 self._declare_anew(now, f"{neighbour.name} does not hear us")
             if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
@@ -562,6 +587,21 @@ class Mesh:
             if now - since > SILENT_S:
                 del self._strangers[name]
                 self._ask_anew(name)
+
+    def _lost_sight(self, neighbour: Neighbour, now: float) -> None:
+        """It is announced and silent: end the links to it, or, where others relay, what may be wrong with ours."""
+        if now - neighbour.hung_up_at < HANG_UP_EVERY_S:
+            return
+        neighbour.hung_up_at = now
+        neighbour.hung_up += 1
+        if neighbour.zenoh_id in self._bus.linked:
+            log.warning("mesh: %s is announced and silent; connecting anew", neighbour.name)
+            self._bus.hang_up(neighbour.zenoh_id)
+        elif neighbour.hung_up == 1:
+            self._declare_anew(now, f"{neighbour.name} is announced and silent")
+        else:
+            log.warning("mesh: %s is still silent; connecting anew with everybody", neighbour.name)
+            self._bus.hang_up(None)
 
     def _differs(self, neighbour: Neighbour, now: float) -> None:
         """We have missed a token of a broker, or that one was withdrawn."""

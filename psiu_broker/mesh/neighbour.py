@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
+from math import inf
 from typing import Final
 
 from psiu_broker.frame import MESH, Way
@@ -12,7 +13,7 @@ BEAT_S: Final = 0.4
 ALIVE_S: Final = 0.9
 """A broker whose last beat is older may be gone: its robots are anybody's who hears them."""
 SILENT_S: Final = 2.2
-"""A broker that is announced and yet so long silent does not know of us: we declare everything anew."""
+"""A broker that is announced and yet so long silent has lost sight of us: longer than a Zenoh session's lease."""
 OFFSETS: Final = 64
 ROUND_TRIPS: Final = 8
 
@@ -31,6 +32,9 @@ class Neighbour:
         """Since when its beats do not mention ours."""
         self.differs_since: float | None = None
         """Since when what it says that it claims is not what we have seen announced."""
+        self.hung_up = 0
+        """How often we ended the links to it since it was last heard."""
+        self.hung_up_at = -inf
         self.sent: dict[int, int] = {}
         """How many frames we sent it, by lane."""
         self.received: dict[int, Sequence] = {}
@@ -73,8 +77,13 @@ class Neighbour:
     def beat(self, beat: Beat, own: str, now: float) -> None:
         """Note a beat that came now."""
         self.beat_at = now
+        self.hung_up = 0
         self._sent_us = beat.sent_us
         self._offsets.append(now - beat.sent_us / 1e6)
+        for lane, count in beat.sent.get(own, {}).items():
+            self._series(lane).expect(count)
+        if beat.heard is None:
+            return
         echo = beat.heard.get(own)
         if echo is None:
             self.deaf_since = now if self.deaf_since is None else self.deaf_since
@@ -102,12 +111,15 @@ class Neighbour:
 
     def take(self, lane: int, number: int) -> bool:
         """Note a frame from it; False for one that came before."""
+        new = self._series(lane).take(number)
+        self.doubles += not new
+        return new
+
+    def _series(self, lane: int) -> Sequence:
         series = self.received.get(lane)
         if series is None:
             series = self.received[lane] = Sequence()
-        new = series.take(number)
-        self.doubles += not new
-        return new
+        return series
 
 
 class Neighbours:

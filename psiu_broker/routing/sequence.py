@@ -22,12 +22,19 @@ class Sequence:
         """How many that should have come by now did not; one that comes late after all is taken off."""
         return self._newest - self.received
 
+    def expect(self, number: int) -> None:
+        """`number` has been sent: if it has not come, it is late or lost."""
+        ahead = number - self._newest
+        if ahead > 0:
+            self._seen = self._seen << ahead & ((1 << WINDOW) - 1) if ahead < WINDOW else 0
+            self._newest = number
+
     def take(self, number: int) -> bool:
         """Note `number`; False if it came before, or is too old to tell."""
         ahead = number - self._newest
         if ahead > 0:
-            self._seen = (self._seen << ahead | 1) & ((1 << WINDOW) - 1) if ahead < WINDOW else 1
-            self._newest = number
+            self.expect(number)
+            self._seen |= 1
         else:
             if ahead <= -WINDOW or number < 1 or self._seen >> -ahead & 1:
                 return False

@@ -54,6 +54,8 @@ class Token(NamedTuple):
 class Session:
     """Implements `mesh.MeshBus` for one life of one broker."""
 
+    linked = ()
+
     def __init__(self, simulation: "Simulation", name: str, serial: int) -> None:
         self.zenoh_id = f"{name}-{serial}"
         self.tokens: dict[Claim | None, Token] = {}
@@ -100,6 +102,10 @@ class Session:
             self._declare(claim)
         for token in old.values():
             self._simulation.tell_all("untoken", token)
+
+    def hang_up(self, zenoh_id: str | None) -> None:
+        """New connections bring all declarations with them."""
+        self.declare_anew()
 
     def _declare(self, claim: Claim | None) -> None:
         token = self.tokens[claim] = Token(self._name, self._epoch, self.zenoh_id, self._edition, claim)
