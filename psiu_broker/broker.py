@@ -497,7 +497,7 @@ class _Bus:
                 session,
                 await Publisher.open(session, keys, name, _describer(broker.configuration), broker.names()),
                 await ZenohMesh.open(session, keys, name, broker.mesh),
-                await Calls.open(session, keys, broker.call, broker.send),
+                await Calls.open(session, keys, broker.call, broker.send, relayed=mesh.mode == "router"),
                 await Queries.open(session, keys, name, broker),
                 await Traces.open(session, keys, name, broker.trace, broker.tracing.probed),
                 await RoundTrip.open(session, keys, name),

@@ -17,6 +17,7 @@ import zenoh
 from pydantic import ValidationError
 
 from psiu_broker.bus.keys import Keys
+from psiu_broker.bus.once import Once
 from psiu_broker.bus.replies import Replies
 from psiu_broker.bus.session import Session, json_of
 from psiu_broker.errors import CallError
@@ -39,6 +40,7 @@ PAYLOAD_MAX: Final = 65_536
 RING: Final = 1024
 
 _ANSWER: Final = json_of("Answer")
+_SAME_WORDS: Final = "the same call came a moment ago; routers double calls, so attach an id of your own to repeat one"
 _STOPPING: Final = "the broker is stopping; the command may have been carried out"
 
 
@@ -55,7 +57,7 @@ class _Accepted(NamedTuple):
 class Calls:
     """Hands the calls of other programs to the broker and its answers back."""
 
-    def __init__(self, session: Session, keys: Keys, call: Call, send: Send) -> None:
+    def __init__(self, session: Session, keys: Keys, call: Call, send: Send, *, relayed: bool) -> None:
         self.refused_puts = 0
         self._session = session
         self._keys = keys
@@ -64,18 +66,20 @@ class Calls:
         self._replies = Replies(session, "bus-call")
         self._room = threading.BoundedSemaphore(AT_ONCE_MAX)
         self._stop_room = threading.BoundedSemaphore(AT_ONCE_MAX)
+        self._gets = Once(relayed=relayed)
+        self._puts = Once(relayed=relayed)
         self._closed = False
         self._tasks: set[asyncio.Task[None]] = set()
 
     @classmethod
-    async def open(cls, session: Session, keys: Keys, call: Call, send: Send) -> "Calls":
-        """Take calls from now on. `call` serves gets, `send` puts.
+    async def open(cls, session: Session, keys: Keys, call: Call, send: Send, *, relayed: bool = False) -> "Calls":
+        """Take calls from now on. `call` serves gets, `send` puts; `relayed` as in `Once`.
 
         Raises:
             BusError: the session is closed or lost.
         """
 
-        calls = cls(session, keys, call, send)
+        calls = cls(session, keys, call, send, relayed=relayed)
         ring = zenoh.handlers.RingChannel
         await session.serve(
             lambda: session.zenoh.declare_queryable(keys.every_call, ring(RING)),
@@ -103,9 +107,16 @@ class Calls:
 
     def _sift_query(self, query: zenoh.Query) -> _Accepted | None:
         """What of `query` the loop must see."""
+        key, payload = str(query.key_expr), _bytes(query.payload)
+        call_id = _bytes(query.attachment)
         try:
             _refuse_parameters(query.parameters)
-            return self._accepted(str(query.key_expr), query.payload, query)
+            if self._gets.is_double(call_id, key, payload):
+                if call_id:
+                    self._replies.drop(query)
+                    return None
+                _refuse_double()
+            return self._accepted(key, payload, query)
         except CallError as error:
             self._replies.turn_away(query, error)
             return None
@@ -113,18 +124,21 @@ class Calls:
     def _sift_put(self, sample: zenoh.Sample) -> _Accepted | None:
         if sample.kind != zenoh.SampleKind.PUT:
             return None
+        key, payload = str(sample.key_expr), _bytes(sample.payload)
         try:
-            return self._accepted(str(sample.key_expr), sample.payload, None)
+            if self._puts.is_double(_bytes(sample.attachment), key, payload):
+                _refuse_double()
+            return self._accepted(key, payload, None)
         except CallError as error:
             self._refused_put(str(sample.key_expr), error)
             return None
 
-    def _accepted(self, key: str, payload: zenoh.ZBytes | None, query: zenoh.Query | None) -> _Accepted:
+    def _accepted(self, key: str, payload: bytes, query: zenoh.Query | None) -> _Accepted:
         try:
             robot, command = self._keys.read_call(key)
         except ValueError as error:
             raise CallError("bad_request", str(error)) from error
-        request = read_request(payload.to_bytes() if payload is not None else b"")
+        request = read_request(payload)
         room = self._stop_room if is_stop(command) else self._room
         if not room.acquire(blocking=False):
             raise CallError("busy", f"{AT_ONCE_MAX} calls are under way already")
@@ -180,6 +194,14 @@ class Calls:
     def _refused_put(self, key: str, error: CallError) -> None:
         self.refused_puts += 1
         logger.debug("a put to %s was refused: %s", key, error)
+
+
+def _refuse_double() -> None:
+    raise CallError("busy", _SAME_WORDS)
+
+
+def _bytes(value: zenoh.ZBytes | None) -> bytes:
+    return b"" if value is None else value.to_bytes()
 
 
 def read_request(payload: bytes) -> CallRequest:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, Literal
+from uuid import uuid4
 
 import zenoh
 from pydantic import ValidationError
@@ -89,6 +90,10 @@ class Client:
         wait_s = CALL_TIMEOUT_S if request.timeout_s is None else request.timeout_s + DEADLINE_MARGIN_S
         found = self._get(self._call_key(robot, command), wait_s, request.model_dump_json(exclude_none=True))
         if not found:
+            if self.brokers():
+                raise CallError(
+                    "outcome_unknown", "the broker that has the robot went away; it may have been done or not"
+                )
             raise CallError("no_answer", "no broker on the bus takes calls")
         try:
             return Answer.model_validate_json(found[0][1])
@@ -103,6 +108,7 @@ class Client:
                 self._call_key(robot, command),
                 request.model_dump_json(exclude_none=True),
                 encoding=JSON,
+                attachment=uuid4().bytes,
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
         except zenoh.ZError as error:
@@ -133,6 +139,7 @@ class Client:
                 timeout=timeout_s,
                 payload=payload,
                 encoding=JSON if payload is not None else None,
+                attachment=uuid4().bytes if payload is not None else None,
             )
             for reply in replies:
                 if reply.ok is not None:

@@ -56,6 +56,12 @@ class Replies:
             refused = self._submit(_refuse, query, error)
             refused.add_done_callback(lambda _: self._away_room.release())
 
+    def drop(self, query: zenoh.Query) -> None:
+        """End a query without a word: another copy of it is answered. In the thread that reads queries."""
+        if self._away_room.acquire(blocking=False):
+            dropped = self._submit(_answer, query, {})
+            dropped.add_done_callback(lambda _: self._away_room.release())
+
     async def sent(self) -> None:
         """Wait for what `answer` and `refuse` have on its way out, for at most `SENT_S`."""
         if self._pending:

@@ -17,6 +17,7 @@ class Beat(BaseModel):
 
     broker: str = Field(min_length=1, max_length=255)
     epoch: int = Field(ge=0, lt=2**64, description="which life of the broker this is")
+    zenoh_id: str = Field(default="", max_length=32)
     sent_us: Micros = Field(description="by the sender's clock")
     heard: dict[str, tuple[Micros, Micros]] | None = Field(
         default=None,

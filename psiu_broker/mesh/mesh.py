@@ -9,7 +9,7 @@ import logging
 import secrets
 from collections.abc import Callable, Collection, Hashable, Iterator
 from math import inf
-from typing import Final, Protocol
+from typing import Final, Literal, NamedTuple, Protocol
 
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import MESH, Address, Frame, Way
@@ -32,7 +32,9 @@ GIVEN_S: Final = 1.0
 ORPHANED_S: Final = 1.0
 """How long a robot whose broker is gone may be without an owner before its card is deleted."""
 ANEW_EVERY_S: Final = 3.0
-HANG_UP_EVERY_S: Final = 3.0
+STEP_EVERY_S: Final = 2.0
+HANG_UP_EVERY_S: Final = 8.0
+"""Ending every link is for what nothing else mends."""
 ASLEEP_S: Final = 1.0
 """A pause between our own beats that is no mere load: then it is we who were not there."""
 FULL_EVERY: Final = 4
@@ -129,6 +131,17 @@ class MeshBus(Protocol):
         """End the links to a broker, or to all, so that they begin anew."""
 
 
+Trouble = Literal["silent", "deaf", "unclear"]
+
+
+class _Stranger(NamedTuple):
+    """A broker that is heard and not announced."""
+
+    name: str
+    zenoh_id: str
+    since: float
+
+
 class _NoBus:
     """In the bus's place while there is none."""
 
@@ -200,10 +213,11 @@ class Mesh:
         self._given: dict[Address, float] = {}
         self._orphans: dict[Address, tuple[str, float]] = {}
         """Robots that nobody owns any more: who did last, and until when."""
-        self._strangers: dict[str, float] = {}
+        self._strangers: dict[str, _Stranger] = {}
         self._beats = 0
         self._beaten = -inf
         self._awake_since = -inf
+        self._hung_up_at = -inf
         self._anew_at = -inf
 
     # The bus comes and goes.
@@ -336,7 +350,7 @@ class Mesh:
         neighbour = self.neighbours.find(beat.broker)
         if neighbour is None or neighbour.epoch != beat.epoch:
             if beat.broker != self.own:
-                self._stranger(beat.broker, now)
+                self._stranger(beat, now)
             return
         self._strangers.pop(beat.broker, None)
         neighbour.beat(beat, self.own, now)
@@ -431,6 +445,7 @@ class Mesh:
         beat = Beat(
             broker=self.own,
             epoch=self.epoch,
+            zenoh_id=self._bus.zenoh_id,
             sent_us=int(now * 1e6),
             claims=digest(self.claims.of(self.own).values()),
         )
@@ -576,31 +591,50 @@ class Mesh:
     def _guard(self, now: float) -> None:
         """Notice who has lost sight of us, or we of them: Zenoh does, and does not always mend it."""
         for neighbour in self.neighbours:
-            if now - max(neighbour.last_sign(), self._awake_since) > SILENT_S:
-                self._lost_sight(neighbour, now)
-            elif neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
-                self._declare_anew(now, f"{neighbour.name} does not hear us")
-            if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
-                neighbour.differs_since = now
-                self._differs(neighbour, now)
-        for name, since in list(self._strangers.items()):
-            if now - since > SILENT_S:
-                del self._strangers[name]
-                self._ask_anew(name)
+            trouble = self._trouble(neighbour, now)
+            if trouble is None:
+                neighbour.steps = 0
+            elif now - neighbour.stepped_at >= STEP_EVERY_S:
+                neighbour.stepped_at = now
+                neighbour.steps += 1
+                self._step(neighbour, trouble, now)
+        for stranger in list(self._strangers.values()):
+            if now - stranger.since > SILENT_S:
+                del self._strangers[stranger.name]
+                self._ask_anew(stranger.name)
+                self._connect_anew(stranger.zenoh_id, now, f"{stranger.name} is heard and not announced")
 
-    def _lost_sight(self, neighbour: Neighbour, now: float) -> None:
-        """It is announced and silent: end the links to it, or, where others relay, what may be wrong with ours."""
-        if now - neighbour.hung_up_at < HANG_UP_EVERY_S:
+    def _trouble(self, neighbour: Neighbour, now: float) -> Trouble | None:
+        if now - max(neighbour.last_sign(), self._awake_since) > SILENT_S:
+            return "silent"
+        if neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
+            return "deaf"
+        if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
+            return "unclear"
+        return None
+
+    def _step(self, neighbour: Neighbour, trouble: Trouble, now: float) -> None:
+        """Do more each time against the same trouble: ask and declare anew, then connect anew."""
+        name = neighbour.name
+        if trouble == "unclear":
+            self._differs(neighbour, now)
+        if trouble == "unclear" and neighbour.steps == 1:
             return
-        neighbour.hung_up_at = now
-        neighbour.hung_up += 1
-        if neighbour.zenoh_id in self._bus.linked:
-            log.warning("mesh: %s is announced and silent; connecting anew", neighbour.name)
-            self._bus.hang_up(neighbour.zenoh_id)
-        elif neighbour.hung_up == 1:
-            self._declare_anew(now, f"{neighbour.name} is announced and silent")
+        if trouble == "unclear" and neighbour.steps == 2:
+            self._declare_anew(now, f"what {name} announces does not come")
+        elif neighbour.steps == 1 and neighbour.zenoh_id not in self._bus.linked:
+            self._declare_anew(now, f"{name} is announced and {trouble}")
         else:
-            log.warning("mesh: %s is still silent; connecting anew with everybody", neighbour.name)
+            self._connect_anew(neighbour.zenoh_id, now, f"{name} is announced and {trouble}")
+
+    def _connect_anew(self, zenoh_id: str, now: float, why: str) -> None:
+        """End the links to a broker, or, where others relay, all that we have: something is wrong with one of them."""
+        if zenoh_id in self._bus.linked:
+            log.warning("mesh: connecting anew: %s", why)
+            self._bus.hang_up(zenoh_id)
+        elif now - self._hung_up_at >= HANG_UP_EVERY_S:
+            self._hung_up_at = now
+            log.warning("mesh: connecting anew with everybody: %s", why)
             self._bus.hang_up(None)
 
     def _differs(self, neighbour: Neighbour, now: float) -> None:
@@ -613,10 +647,10 @@ class Mesh:
             tokens.ask()
             self._ask_anew(neighbour.name)
 
-    def _stranger(self, name: str, now: float) -> None:
+    def _stranger(self, beat: Beat, now: float) -> None:
         """A beat of a broker that is not announced to us."""
         if len(self._strangers) < STRANGERS_MAX:
-            self._strangers.setdefault(name, now)
+            self._strangers.setdefault(beat.broker, _Stranger(beat.broker, beat.zenoh_id, now))
 
     def _ask_anew(self, name: str) -> None:
         log.info("mesh: asking %s to declare anew what it has", name)

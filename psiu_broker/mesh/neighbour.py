@@ -32,9 +32,9 @@ class Neighbour:
         """Since when its beats do not mention ours."""
         self.differs_since: float | None = None
         """Since when what it says that it claims is not what we have seen announced."""
-        self.hung_up = 0
-        """How often we ended the links to it since it was last heard."""
-        self.hung_up_at = -inf
+        self.steps = 0
+        """What was done against a trouble with it that goes on."""
+        self.stepped_at = -inf
         self.sent: dict[int, int] = {}
         """How many frames we sent it, by lane."""
         self.received: dict[int, Sequence] = {}
@@ -77,7 +77,6 @@ class Neighbour:
     def beat(self, beat: Beat, own: str, now: float) -> None:
         """Note a beat that came now."""
         self.beat_at = now
-        self.hung_up = 0
         self._sent_us = beat.sent_us
         self._offsets.append(now - beat.sent_us / 1e6)
         for lane, count in beat.sent.get(own, {}).items():

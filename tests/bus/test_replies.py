@@ -26,6 +26,7 @@ class Asker:
     key_expr = "psiu/@call/A/b"
     parameters = "100"  # bad_request, for a call
     payload = None
+    attachment = None
 
     def __init__(self) -> None:
         self.reads = threading.Event()
