@@ -9,7 +9,7 @@ offers no way to end a link, so the sockets of this process are shut down under 
 import os
 import re
 import socket
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -27,12 +27,25 @@ def hang_up(links: Iterable[tuple[str, str]]) -> int:
     """
     wanted = {(own, far) for ours, theirs in links if (own := _name(ours)) and (far := _name(theirs))}
     ended = 0
-    for open_file in OPEN_FILES.iterdir() if wanted else ():
-        with suppress(OSError), socket.socket(fileno=os.dup(int(open_file.name))) as connection:
-            if _ends(connection) in wanted:
-                connection.shutdown(socket.SHUT_RDWR)
-                ended += 1
+    for number in [int(open_file.name) for open_file in OPEN_FILES.iterdir()] if wanted else []:
+        with suppress(OSError):
+            ended += _end(number, wanted)
     return ended
+
+
+def _end(number: int, wanted: Collection[tuple[str, str]]) -> bool:
+    """Shut the open file down if it is one of the connections. Raises OSError where it is none at all."""
+    copy = os.dup(number)  # Zenoh may close its own at any moment, and another file may get the number
+    try:
+        connection = socket.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        raise
+    with connection:
+        if _ends(connection) not in wanted:
+            return False
+        connection.shutdown(socket.SHUT_RDWR)
+        return True
 
 
 def _ends(connection: socket.socket) -> tuple[str, str]:
