@@ -6,16 +6,17 @@ again, because Zenoh itself relays between brokers. What is known comes from ann
 """
 
 import logging
+import random
 import secrets
 from collections.abc import Callable, Collection, Hashable, Iterator
 from math import inf
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import Final, Literal, Protocol
 
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import MESH, Address, Frame, Way
 from psiu_broker.mesh.beat import Beat, Notice, digest
 from psiu_broker.mesh.envelope import Envelope, pack, unpack
-from psiu_broker.mesh.neighbour import BEAT_S, SILENT_S, Neighbour, Neighbours
+from psiu_broker.mesh.neighbour import BEAT_S, SILENT_S, Neighbour, Neighbours, Remedy
 from psiu_broker.routing.claims import Claim, age_of
 from psiu_broker.routing.outbox import Fate, lane
 from psiu_broker.routing.ownership import Ownership
@@ -31,8 +32,7 @@ GIVEN_S: Final = 1.0
 """How long a robot that we gave up may be without an owner before we look for it again."""
 ORPHANED_S: Final = 1.0
 """How long a robot whose broker is gone may be without an owner before its card is deleted."""
-ANEW_EVERY_S: Final = 3.0
-STEP_EVERY_S: Final = 2.0
+ANEW_EVERY_S: Final = 1.5
 HANG_UP_EVERY_S: Final = 8.0
 """Ending every link is for what nothing else mends."""
 ASLEEP_S: Final = 1.0
@@ -134,12 +134,14 @@ class MeshBus(Protocol):
 Trouble = Literal["silent", "deaf", "unclear"]
 
 
-class _Stranger(NamedTuple):
+class _Stranger:
     """A broker that is heard and not announced."""
 
-    name: str
-    zenoh_id: str
-    since: float
+    def __init__(self, name: str, zenoh_id: str, now: float) -> None:
+        self.name = name
+        self.zenoh_id = zenoh_id
+        self.since = self.heard_at = now
+        self.remedy = Remedy()
 
 
 class _NoBus:
@@ -593,16 +595,21 @@ class Mesh:
         for neighbour in self.neighbours:
             trouble = self._trouble(neighbour, now)
             if trouble is None:
-                neighbour.steps = 0
-            elif now - neighbour.stepped_at >= STEP_EVERY_S:
-                neighbour.stepped_at = now
-                neighbour.steps += 1
-                self._step(neighbour, trouble, now)
+                neighbour.remedy.over()
+            elif neighbour.remedy.is_due(now):
+                self._remedy(
+                    neighbour.name, neighbour.zenoh_id, neighbour.remedy.steps, f"announced and {trouble}", now
+                )
+                if trouble == "unclear":
+                    self._differs(neighbour, now)
         for stranger in list(self._strangers.values()):
-            if now - stranger.since > SILENT_S:
+            if now - stranger.heard_at > SILENT_S:
                 del self._strangers[stranger.name]
+            elif now - stranger.since > SILENT_S and stranger.remedy.is_due(now):
                 self._ask_anew(stranger.name)
-                self._connect_anew(stranger.zenoh_id, now, f"{stranger.name} is heard and not announced")
+                self._remedy(
+                    stranger.name, stranger.zenoh_id, stranger.remedy.steps - 1, "heard and not announced", now
+                )
 
     def _trouble(self, neighbour: Neighbour, now: float) -> Trouble | None:
         if now - max(neighbour.last_sign(), self._awake_since) > SILENT_S:
@@ -613,28 +620,19 @@ class Mesh:
             return "unclear"
         return None
 
-    def _step(self, neighbour: Neighbour, trouble: Trouble, now: float) -> None:
-        """Do more each time against the same trouble: ask and declare anew, then connect anew."""
-        name = neighbour.name
-        if trouble == "unclear":
-            self._differs(neighbour, now)
-        if trouble == "unclear" and neighbour.steps == 1:
-            return
-        if trouble == "unclear" and neighbour.steps == 2:
-            self._declare_anew(now, f"what {name} announces does not come")
-        elif neighbour.steps == 1 and neighbour.zenoh_id not in self._bus.linked:
-            self._declare_anew(now, f"{name} is announced and {trouble}")
-        else:
-            self._connect_anew(neighbour.zenoh_id, now, f"{name} is announced and {trouble}")
+    def _remedy(self, name: str, zenoh_id: str, step: int, trouble: str, now: float) -> None:
+        """Do more each time against the same trouble with a broker: declare anew, then connect anew.
 
-    def _connect_anew(self, zenoh_id: str, now: float, why: str) -> None:
-        """End the links to a broker, or, where others relay, all that we have: something is wrong with one of them."""
-        if zenoh_id in self._bus.linked:
-            log.warning("mesh: connecting anew: %s", why)
+        In steps, because each remedy is itself a trouble for others for a moment.
+        """
+        if 1 <= step <= 2:
+            self._declare_anew(now, f"{name} is {trouble}")
+        elif step > 2 and zenoh_id in self._bus.linked:
+            log.warning("mesh: connecting anew: %s is %s", name, trouble)
             self._bus.hang_up(zenoh_id)
-        elif now - self._hung_up_at >= HANG_UP_EVERY_S:
+        elif step > 3 and now - self._hung_up_at >= HANG_UP_EVERY_S * random.uniform(1, 2):  # noqa: S311
             self._hung_up_at = now
-            log.warning("mesh: connecting anew with everybody: %s", why)
+            log.warning("mesh: connecting anew with everybody: %s is %s", name, trouble)
             self._bus.hang_up(None)
 
     def _differs(self, neighbour: Neighbour, now: float) -> None:
@@ -649,8 +647,11 @@ class Mesh:
 
     def _stranger(self, beat: Beat, now: float) -> None:
         """A beat of a broker that is not announced to us."""
-        if len(self._strangers) < STRANGERS_MAX:
-            self._strangers.setdefault(beat.broker, _Stranger(beat.broker, beat.zenoh_id, now))
+        stranger = self._strangers.get(beat.broker)
+        if stranger is None and len(self._strangers) < STRANGERS_MAX:
+            stranger = self._strangers[beat.broker] = _Stranger(beat.broker, beat.zenoh_id, now)
+        if stranger is not None:
+            stranger.heard_at = now
 
     def _ask_anew(self, name: str) -> None:
         log.info("mesh: asking %s to declare anew what it has", name)

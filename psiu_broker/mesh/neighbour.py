@@ -14,8 +14,30 @@ ALIVE_S: Final = 0.9
 """A broker whose last beat is older may be gone: its robots are anybody's who hears them."""
 SILENT_S: Final = 2.2
 """A broker that is announced and yet so long silent has lost sight of us: longer than a Zenoh session's lease."""
+STEP_EVERY_S: Final = 1.5
 OFFSETS: Final = 64
 ROUND_TRIPS: Final = 8
+
+
+class Remedy:
+    """How far we have gone against a trouble with another broker."""
+
+    __slots__ = ("_at", "steps")
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self._at = -inf
+
+    def is_due(self, now: float) -> bool:
+        """Whether it is time for the next step, which is then `steps`."""
+        if now - self._at < STEP_EVERY_S:
+            return False
+        self._at = now
+        self.steps += 1
+        return True
+
+    def over(self) -> None:
+        self.steps = 0
 
 
 class Neighbour:
@@ -32,9 +54,7 @@ class Neighbour:
         """Since when its beats do not mention ours."""
         self.differs_since: float | None = None
         """Since when what it says that it claims is not what we have seen announced."""
-        self.steps = 0
-        """What was done against a trouble with it that goes on."""
-        self.stepped_at = -inf
+        self.remedy = Remedy()
         self.sent: dict[int, int] = {}
         """How many frames we sent it, by lane."""
         self.received: dict[int, Sequence] = {}

@@ -195,7 +195,7 @@ class Lab:
             f"tcp/{cable.address(other)}:{BUS}"
             for cable in self.network.cables_of(node)
             for other in (cable.a, cable.b)
-            if other != node
+            if other < node  # each link has one side that connects
         ]
         return CONFIGURATION.format(broker=name, mode=self.mode, connect=json.dumps(neighbours), timeout_s=CALL_S)
 
