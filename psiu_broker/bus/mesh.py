@@ -97,7 +97,7 @@ class ZenohMesh:
         )
         await session.serve(watch("broker/**"), bus._broker_token, lambda it: it(now()), name="mesh-brokers")
         await session.serve(watch("robot/**"), bus._robot_token, lambda it: it(now()), name="mesh-robots")
-        mesh.attach(bus, now())
+        mesh.attach(bus, now(), time.time_ns())
         return bus
 
     # mesh.MeshBus

@@ -134,6 +134,17 @@ class MeshBus(Protocol):
 Trouble = Literal["silent", "deaf", "unclear"]
 
 
+class _Life:
+    """One life of a broker, as it is announced."""
+
+    __slots__ = ("editions", "zenoh_id")
+
+    def __init__(self, zenoh_id: str) -> None:
+        self.zenoh_id = zenoh_id
+        self.editions: set[str] = set()
+        """Its announcements: two for a moment while it declares everything anew."""
+
+
 class _Stranger:
     """A broker that is heard and not announced."""
 
@@ -208,6 +219,8 @@ class Mesh:
         self._identity = identity
         self._bus: MeshBus = _NoBus()
         self._attached = False
+        self._announced: dict[str, dict[int, _Life]] = {}
+        """Each broker's lives that are announced: one, and for a while what Zenoh still keeps of a former one."""
         self._former: dict[tuple[str, int], Neighbour] = {}
         """Brokers that went, by name and life: if they were only out of sight, the series go on."""
         self._tokens: dict[tuple[str, int], Tokens] = {}
@@ -221,14 +234,17 @@ class Mesh:
         self._awake_since = -inf
         self._hung_up_at = -inf
         self._anew_at = -inf
+        self._anew_wanted: str | None = None
+        """Why everything should be declared anew."""
 
     # The bus comes and goes.
 
-    def attach(self, bus: MeshBus, now: float) -> None:
-        """A session is open: begin a new life on it."""
+    def attach(self, bus: MeshBus, now: float, epoch: int | None = None) -> None:
+        """A session is open: begin a new life on it, with an epoch that should be greater than any before it."""
         self._bus = bus
         self._attached = True
-        self.epoch = secrets.randbits(64)
+        self.epoch = secrets.randbits(62) if epoch is None else epoch
+        self._anew_wanted = None
         self._former.clear()
         self._anew_at = now
         bus.announce(self.epoch)
@@ -242,6 +258,7 @@ class Mesh:
             self._lose(neighbour, now)
         for robot in self.claims.of(self.own):
             self.claims.remove(self.own, robot)
+        self._announced.clear()
         self._tokens.clear()
         self._orphans.clear()
         self.namesakes.clear()
@@ -277,19 +294,24 @@ class Mesh:
             if epoch != self.epoch:
                 self.namesakes[epoch] = now
             return
+        life = self._announced.setdefault(name, {}).setdefault(epoch, _Life(zenoh_id))
+        life.editions.add(edition)
         known = self.neighbours.find(name)
-        if known is not None:
-            if known.epoch == epoch:
-                known.editions.add(edition)
-                self._tokens_of(name, epoch).renewed = True
-                return
+        if known is None:
+            self._begin(name, epoch, now)
+        elif known.epoch == epoch:
+            self._tokens_of(name, epoch).renewed = True
+        elif epoch > known.epoch and not known.alive(now):
             self._lose(known, now)
+            self._begin(name, epoch, now)
+
+    def _begin(self, name: str, epoch: int, now: float) -> None:
+        """A broker is there, in the life that is announced as `epoch`."""
         neighbour = self._former.pop((name, epoch), None)
         if neighbour is None:
-            neighbour = Neighbour(name, epoch, zenoh_id, now)
+            neighbour = Neighbour(name, epoch, self._announced[name][epoch].zenoh_id, now)
         else:
             neighbour.returned(now)
-        neighbour.editions = {edition}
         self.neighbours.add(neighbour)
         self._settle(Address.named(name), now)
         for claim in self._tokens_of(name, epoch):
@@ -302,11 +324,21 @@ class Mesh:
     def broker_went(self, name: str, epoch: int, edition: str, now: float) -> None:
         """An announcement is no more; with its last one the broker is gone."""
         self.namesakes.pop(epoch, None)
+        lives = self._announced.get(name, {})
+        life = lives.get(epoch)
+        if life is None:
+            return
+        life.editions.discard(edition)
+        if life.editions:
+            return
+        del lives[epoch]
         neighbour = self.neighbours.find(name)
         if neighbour is not None and neighbour.epoch == epoch:
-            neighbour.editions.discard(edition)
-            if not neighbour.editions:
-                self._lose(neighbour, now)
+            self._lose(neighbour, now)
+            if lives:
+                self._begin(name, max(lives), now)
+        if not lives:
+            del self._announced[name]
 
     def _lose(self, neighbour: Neighbour, now: float) -> None:
         name = neighbour.name
@@ -349,10 +381,18 @@ class Mesh:
             self._hub.relayed(envelope.frame, neighbour.way, now, age_s)
 
     def beat_came(self, beat: Beat, now: float) -> None:
+        if beat.broker == self.own:
+            return
         neighbour = self.neighbours.find(beat.broker)
         if neighbour is None or neighbour.epoch != beat.epoch:
-            if beat.broker != self.own:
+            if beat.epoch not in self._announced.get(beat.broker, {}):
                 self._stranger(beat, now)
+                return
+            if neighbour is not None:  # the announcement of a former life is still there
+                self._lose(neighbour, now)
+            self._begin(beat.broker, beat.epoch, now)
+            neighbour = self.neighbours.find(beat.broker)
+        if neighbour is None:
             return
         self._strangers.pop(beat.broker, None)
         neighbour.beat(beat, self.own, now)
@@ -426,6 +466,7 @@ class Mesh:
                 self.notify(owner, frame, way, heard_at)
             self._set_right(now)
             self._guard(now)
+            self._declare_what_is_wanted(now)
 
     def conflicts(self, now: float) -> Iterator[tuple[str, set[str], float, str]]:
         """Names that more than one robot or broker has: the name, at which brokers, since when, and what it means."""
@@ -658,7 +699,14 @@ class Mesh:
         self._bus.put_notice(name, Notice(broker=self.own))
 
     def _declare_anew(self, now: float, why: str) -> None:
-        if now - self._anew_at >= ANEW_EVERY_S:
+        """Declare everything anew, now or as soon as it was not just done."""
+        self._anew_wanted = why
+        self._declare_what_is_wanted(now)
+
+    def _declare_what_is_wanted(self, now: float) -> None:
+        why = self._anew_wanted
+        if why is not None and now - self._anew_at >= ANEW_EVERY_S:
+            self._anew_wanted = None
             self._anew_at = now
             self.declared_anew += 1
             log.warning("mesh: declaring everything anew: %s", why)

@@ -59,8 +59,6 @@ class Neighbour:
         """How many frames we sent it, by lane."""
         self.received: dict[int, Sequence] = {}
         self.doubles = 0
-        self.editions: set[str] = set()
-        """Its announcements that stand."""
         self._sent_us = 0
         self._offsets: deque[float] = deque(maxlen=OFFSETS)
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)
