@@ -16,6 +16,7 @@ tokens are there before the old ones go.
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Executor
 from typing import Any, Final
@@ -64,6 +65,8 @@ class ZenohMesh:
         self._tokens: dict[str, Declared] = {}
         """By key without its edition; touched by the worker only."""
         self._worker: Executor = session.worker("mesh")
+        self._twice: set[str] = set()
+        """Whom two links lead to, as was told once: Zenoh may keep half of one (its issue 2806)."""
         self._anew: asyncio.Task[None] | None = None
 
     @classmethod
@@ -133,14 +136,21 @@ class ZenohMesh:
     async def look(self) -> None:
         """Renew `linked`."""
 
-        def ids() -> set[str]:
-            info = self._session.zenoh.info
-            return {str(each) for each in (*info.routers_zid(), *info.peers_zid())}
+        def ids() -> Counter[str]:
+            return Counter(str(link.zid) for link in self._session.zenoh.info.links())
 
         try:
-            self.linked = await aside(ids)
+            links = await aside(ids)
         except zenoh.ZError as error:
             logger.debug("the session cannot tell its links: %s", plain(error))
+            return
+        self.linked = frozenset(links)
+        for neighbour in self._mesh.neighbours:
+            if links[neighbour.zenoh_id] > 1 and neighbour.zenoh_id not in self._twice:
+                self._twice.add(neighbour.zenoh_id)
+                logger.warning(
+                    "mesh: two links lead to %s; if you name each other in mesh.connect, leave one out", neighbour.name
+                )
 
     async def close(self) -> None:
         """Nothing more is declared; before `Session.close`."""

@@ -16,7 +16,7 @@ from psiu_broker.errors import EncodeError
 from psiu_broker.frame import MESH, Address, Frame, Way
 from psiu_broker.mesh.beat import Beat, Notice, digest
 from psiu_broker.mesh.envelope import Envelope, pack, unpack
-from psiu_broker.mesh.neighbour import BEAT_S, SILENT_S, Neighbour, Neighbours, Remedy
+from psiu_broker.mesh.neighbour import BEAT_S, NEWCOMER_S, SILENT_S, Neighbour, Neighbours, Remedy
 from psiu_broker.routing.claims import Claim, age_of
 from psiu_broker.routing.outbox import Fate, lane
 from psiu_broker.routing.ownership import Ownership
@@ -39,7 +39,7 @@ ASLEEP_S: Final = 1.0
 """A pause between our own beats that is no mere load: then it is we who were not there."""
 FULL_EVERY: Final = 4
 """Every so many beats one says what was heard from everybody; the others are short."""
-DIFFERS_S: Final = 2.0
+DIFFERS_S: Final = 1.2
 NAMESAKE_S: Final = 3.0
 """A broker of our name that is announced for longer than this is no former life of ours."""
 STRANGERS_MAX: Final = 256
@@ -646,14 +646,15 @@ class Mesh:
         for stranger in list(self._strangers.values()):
             if now - stranger.heard_at > SILENT_S:
                 del self._strangers[stranger.name]
-            elif now - stranger.since > SILENT_S and stranger.remedy.is_due(now):
+            elif now - stranger.since > NEWCOMER_S and stranger.remedy.is_due(now):
                 self._ask_anew(stranger.name)
                 self._remedy(
                     stranger.name, stranger.zenoh_id, stranger.remedy.steps - 1, "heard and not announced", now
                 )
 
     def _trouble(self, neighbour: Neighbour, now: float) -> Trouble | None:
-        if now - max(neighbour.last_sign(), self._awake_since) > SILENT_S:
+        patience_s = SILENT_S if neighbour.beat_at is not None else NEWCOMER_S
+        if now - max(neighbour.last_sign(), self._awake_since) > patience_s:
             return "silent"
         if neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
             return "deaf"

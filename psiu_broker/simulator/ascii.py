@@ -55,6 +55,9 @@ AVR_SUM: Final = 32767
 
 _MOVES: Final = {"parafrente": (999, 1), "paratras": (999, -1)}
 _TURNS: Final = {"giradireita": (360, -1), "giraesquerda": (360, 1)}
+SAME_TALK_S: Final = 0.1
+"""Two robots that ask each other's name would answer each other for ever."""
+
 _QUESTIONS: Final = {"quantoscomandos": 0, "exibecomando": 1, "qualseunome": 0}
 _GARBAGE: Final = ("\x03\xb2(", "12290", "-1", "0")
 _OUTCOMES: Final = {"sucesso", "falha", "ok", "respok", "respfalha"}
@@ -174,6 +177,7 @@ class AsciiRobot(Robot):
         self._counted = False
         self._asked: list[tuple[str, str]] = []
         self._met: set[tuple[str, str]] = set()
+        self._told_name: dict[str, float] = {}
         self._legs: deque[_Leg] = deque()
         self._goal = self.position
         self._free_at = -math.inf
@@ -250,7 +254,7 @@ class AsciiRobot(Robot):
         if everyone and command != "qualseunome" and not mine:
             return []
         self.note(Heard(now, source, command, parameters))
-        if not everyone and self._is_answer(source, command, parameters):
+        if not everyone and self._is_answer(source, command, parameters, now):
             return []
         known = self._known.get(command)
         if known is None or not known.accepts(parameters):
@@ -265,13 +269,15 @@ class AsciiRobot(Robot):
             reply = self.say(source, command, *words)
         except ValueError:
             return []  # An answer has to repeat the names and the command, and these may fill a frame.
-        if command == "quantoscomandos":
-            self._counted = True
+        self._told_name[source] = now if command == "qualseunome" and not everyone else -math.inf
+        self._counted |= command == "quantoscomandos"
         if everyone:
             delay_s += self._random.uniform(0.0, self._wildcard_delay_s)
         return [(delay_s, reply)]
 
-    def _is_answer(self, source: str, command: str, parameters: Sequence[str]) -> bool:
+    def _is_answer(self, source: str, command: str, parameters: Sequence[str], now: float) -> bool:
+        if command == "qualseunome" and now - self._told_name.get(source, -math.inf) < SAME_TALK_S:
+            return True
         if (source, command) in self._asked:
             self._asked.remove((source, command))
             return True

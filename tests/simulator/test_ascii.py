@@ -293,3 +293,12 @@ def test_no_bytes_make_the_robot_raise() -> None:
             damaged = bytearray(FORWARD)
             damaged[luck.randrange(len(damaged))] = luck.randrange(256)
             robot.receive(bytes(damaged), n * 0.1)
+
+
+def test_two_robots_that_ask_each_others_name_do_not_answer_for_ever() -> None:
+    one, other = AsciiRobot("MNERIM"), AsciiRobot("GAMA")
+    other.receive(one.command("GAMA", "qualseunome"), 0.0)
+    said = [other.say("MNERIM", "qualseunome")] * 2  # twice the same answer, as where two ways lead there
+    for turn in range(20):
+        said = [reply for data in said for _, reply in (one, other)[turn % 2].receive(data, turn * 0.001)]
+    assert not said
