@@ -25,7 +25,10 @@ def hang_up(links: Iterable[tuple[str, str]]) -> int:
 
     Returns how many there were. Never raises.
     """
-    wanted = {(own, far) for ours, theirs in links if (own := _name(ours)) and (far := _name(theirs))}
+    wanted = {
+        (own, far) for ours, theirs in links if (own := _name(ours)) is not None and (far := _name(theirs)) is not None
+    }
+    wanted.discard(("", ""))
     ended = 0
     for number in [int(open_file.name) for open_file in OPEN_FILES.iterdir()] if wanted else []:
         with suppress(OSError):
@@ -63,9 +66,13 @@ def _text(address: Any) -> str:
             return str(address)
 
 
-def _name(endpoint: str) -> str:
-    """``tcp/127.0.0.1:7447`` as ``127.0.0.1:7447``; nothing for what is no stream."""
+def _name(endpoint: str) -> str | None:
+    """``tcp/127.0.0.1:7447`` as ``127.0.0.1:7447``; None for what is no stream.
+
+    Of a Unix socket's two ends one has a path; the other has no name, whatever Zenoh calls it.
+    """
     if found := _ADDRESS.fullmatch(endpoint):
         return f"{found['host'].removeprefix('::ffff:')}:{found['port']}"
-    found = _PATH.fullmatch(endpoint)
-    return found["path"] if found else ""
+    if found := _PATH.fullmatch(endpoint):
+        return found["path"] if found["path"].startswith("/") else ""
+    return None
