@@ -28,6 +28,9 @@ class Beat(BaseModel):
         default={}, max_length=4096, description="how many frames each broker was sent, by lane; not in every beat"
     )
     claims: str = Field(default="", max_length=64, description="the digest of what the sender claims")
+    unseen: list[str] = Field(
+        default=[], max_length=4096, description="whose announcements the sender lacks: they should declare anew"
+    )
 
 
 class Notice(BaseModel):

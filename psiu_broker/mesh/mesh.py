@@ -33,13 +33,15 @@ GIVEN_S: Final = 1.0
 ORPHANED_S: Final = 1.0
 """How long a robot whose broker is gone may be without an owner before its card is deleted."""
 ANEW_EVERY_S: Final = 1.5
+ASKED_S: Final = 2 * ANEW_EVERY_S
+"""How long a broker that is asked to declare anew may take until that is seen."""
 HANG_UP_EVERY_S: Final = 8.0
 """Ending every link is for what nothing else mends."""
 ASLEEP_S: Final = 1.0
 """A pause between our own beats that is no mere load: then it is we who were not there."""
-FULL_EVERY: Final = 4
+FULL_EVERY: Final = 2
 """Every so many beats one says what was heard from everybody; the others are short."""
-DIFFERS_S: Final = 1.2
+DIFFERS_S: Final = 1.0
 NAMESAKE_S: Final = 3.0
 """A broker of our name that is announced for longer than this is no former life of ours."""
 STRANGERS_MAX: Final = 256
@@ -49,13 +51,14 @@ FORMER_MAX: Final = 1024
 class Tokens:
     """The claims that one life of a broker has declared now: some twice for a moment, while all is declared anew."""
 
-    __slots__ = ("_claims", "_digest", "_round", "renewed")
+    __slots__ = ("_claims", "_digest", "_round", "asked_at", "renewed")
 
     def __init__(self) -> None:
         self._claims: dict[Address, list[tuple[int, Claim]]] = {}
         """With the round of asking in which they were declared, the oldest first."""
         self._digest: str | None = None
         self._round = 0
+        self.asked_at = -inf
         self.renewed = False
         """Since the last `ask`, the broker has declared itself anew, and so all its claims."""
 
@@ -85,8 +88,9 @@ class Tokens:
             return None
         return held[-1][1]
 
-    def ask(self) -> None:
+    def ask(self, now: float) -> None:
         """The broker is asked to declare anew what it has."""
+        self.asked_at = now
         self._round += 1
         self.renewed = False
 
@@ -94,6 +98,7 @@ class Tokens:
         """Forget what was not declared anew since we asked; of which robots."""
         self._digest = None
         self.renewed = False
+        self.asked_at = -inf
         changed = []
         for robot, held in list(self._claims.items()):
             kept = [each for each in held if each[0] == self._round]
@@ -395,6 +400,8 @@ class Mesh:
         if neighbour is None:
             return
         self._strangers.pop(beat.broker, None)
+        if self.own in beat.unseen:
+            self._declare_anew(now, f"{beat.broker} does not see all of it")
         neighbour.beat(beat, self.own, now)
         if beat.claims == self._tokens_of(beat.broker, beat.epoch).digest:
             neighbour.differs_since = None
@@ -491,12 +498,18 @@ class Mesh:
             zenoh_id=self._bus.zenoh_id,
             sent_us=int(now * 1e6),
             claims=digest(self.claims.of(self.own).values()),
+            unseen=self._unseen(now),
         )
         if self._beats % FULL_EVERY == 0:
             heard = {each.name: echo for each in self.neighbours if (echo := each.echo(now)) is not None}
             sent = {each.name: each.sent for each in self.neighbours if each.sent}
             beat = beat.model_copy(update={"heard": heard, "sent": sent})
         self._bus.put_beat(beat)
+
+    def _unseen(self, now: float) -> list[str]:
+        """The brokers that are heard and not announced, or announced otherwise than they say."""
+        strangers = [each.name for each in self._strangers.values() if now - each.since > NEWCOMER_S]
+        return strangers + [each.name for each in self.neighbours if self._trouble(each, now) == "unclear"]
 
     def _settle(self, robot: Address, now: float) -> None:
         """Bring the route to `robot` in line with who claims it."""
@@ -656,7 +669,7 @@ class Mesh:
         patience_s = SILENT_S if neighbour.beat_at is not None else NEWCOMER_S
         if now - max(neighbour.last_sign(), self._awake_since) > patience_s:
             return "silent"
-        if neighbour.deaf_since is not None and now - neighbour.deaf_since > SILENT_S:
+        if neighbour.deaf_since is not None and now - neighbour.deaf_since > NEWCOMER_S:
             return "deaf"
         if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
             return "unclear"
@@ -680,11 +693,11 @@ class Mesh:
     def _differs(self, neighbour: Neighbour, now: float) -> None:
         """We have missed a token of a broker, or that one was withdrawn."""
         tokens = self._tokens_of(neighbour.name, neighbour.epoch)
-        if tokens.renewed:
+        if tokens.renewed and tokens.asked_at > -inf:
             for robot in tokens.sweep():
                 self._follow(neighbour.name, tokens, robot, now)
-        else:
-            tokens.ask()
+        elif now - tokens.asked_at > ASKED_S:
+            tokens.ask(now)
             self._ask_anew(neighbour.name)
 
     def _stranger(self, beat: Beat, now: float) -> None:

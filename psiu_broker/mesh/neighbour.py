@@ -14,7 +14,7 @@ ALIVE_S: Final = 0.9
 """A broker whose last beat is older may be gone: its robots are anybody's who hears them."""
 SILENT_S: Final = 2.2
 """A broker that is announced and yet so long silent has lost sight of us: longer than a Zenoh session's lease."""
-NEWCOMER_S: Final = 1.0
+NEWCOMER_S: Final = 0.9
 """Of a broker that has just been announced, a beat should have come by then."""
 STEP_EVERY_S: Final = 1.5
 OFFSETS: Final = 64

@@ -92,7 +92,7 @@ def test_what_is_not_declared_anew_when_all_is_was_withdrawn_long_ago() -> None:
     tokens = Tokens()
     tokens.add(claim("OLD"))
     tokens.add(claim("MNERIM"))
-    tokens.ask()
+    tokens.ask(0.0)
     tokens.add(claim("MNERIM"))
     assert set(tokens.sweep()) == {Address.named("OLD"), Address.named("MNERIM")}
     assert list(tokens) == [claim("MNERIM")]
