@@ -53,6 +53,7 @@ STOOD_STILL_S: Final = 1.0
 """A pause between ticks that is no mere load: the process was stopped, or the computer slept."""
 STALE_S: Final = 0.3
 """How long after that calls may still come that had waited meanwhile."""
+SETTLING_S: Final = 0.3
 LOOK_AROUND_S: Final = 2.0
 ALIVE_EVERY_S: Final = 0.25
 DOUBLES_MARGIN_S: Final = 2.0
@@ -97,6 +98,7 @@ class Broker:
         )
         self.exchange.join(self.mesh, MAX_AGE_S)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
+        self.resident.settling(lambda: SETTLING_S if neighbours.ways else 0.0)
         self.tracing = Tracing(configuration.broker.name, self.exchange, self.resident.call, self._broker_of)
         self._trunks = Trunks(configuration.broker.name, configuration.trunks.values())
         self.report = Report(configuration.broker.name, self.exchange, self.resident.commands, self._trunks)
@@ -410,8 +412,8 @@ class Broker:
         self._refuse_what_is_stale(command)
         try:
             answer = await self.resident.call(robot, command, request)
-        except CallError:
-            if self._is_elsewhere(robot):
+        except CallError as error:
+            if error.code == "unknown_robot" and self._is_elsewhere(robot):
                 return None
             raise
         self._note(self.exchange.router.robots() if command == DISCOVER else ())
@@ -503,6 +505,7 @@ class _Bus:
                 await RoundTrip.open(session, keys, name),
             )
         except BaseException as error:
+            broker.mesh.detach(time.monotonic())
             await session.close()
             if session.panicked(error):
                 raise BusError(f"zenoh: {plain(error)}") from error

@@ -71,6 +71,8 @@ class Calling:
         self._clock = clock
         self._profiles: dict[Address, Profile] = {}
         self._searches: dict[Address, _Search] = {}
+        self.settling_s: Callable[[], float] = lambda: 0.0
+        """How long another broker may take to say that it heard a robot, too, that was searched for."""
 
     async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
         """Tell `robot` a command and return its answer, within `request.timeout_s` if it is given.
@@ -252,6 +254,9 @@ class Calling:
                 if not search.callers:
                     del self._searches[robot]
             route = self._router.find(robot)
+            if route is not None:
+                await asyncio.sleep(self.settling_s())  # who owns it, of two that hear it, only one commands it
+                route = self._router.find(robot)
             if route is not None:
                 return route
         departed = self._router.table.departed(robot)

@@ -8,14 +8,18 @@ the next life waits until that is long enough ago.
 import asyncio
 import contextlib
 import os
+import stat
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
 HOLD_OFF_S: Final = 2.0
 """Nothing went wrong in 25 restarts after this long; after half a second, up to every second one did."""
+
+LONGEST: Final = 64
 
 CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
@@ -28,22 +32,31 @@ class LastAlive:
 
     def note(self) -> None:
         """It is alive now. A file that cannot be written is in nobody's way: then there is no pause."""
-        with contextlib.suppress(OSError):
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
-            file = os.open(self._path, flags, 0o600)
-            try:
-                os.write(file, f"{time.clock_gettime(CLOCK):.3f}\n".encode())
-            finally:
-                os.close(file)
+        with contextlib.suppress(OSError), self._opened(os.O_WRONLY | os.O_CREAT) as file:
+            os.ftruncate(file, 0)
+            os.write(file, f"{time.clock_gettime(CLOCK):.3f}\n".encode())
 
     def rest_s(self) -> float:
         """How long to wait before the session may open."""
         try:
-            noted = float(self._path.read_text("ascii"))
+            with self._opened(os.O_RDONLY) as file:
+                noted = float(os.read(file, LONGEST).decode("ascii"))
         except (OSError, ValueError):
             return 0.0
         ago = time.clock_gettime(CLOCK) - noted  # negative after the machine has started anew
         return HOLD_OFF_S - ago if 0 <= ago < HOLD_OFF_S else 0.0
+
+    @contextlib.contextmanager
+    def _opened(self, flags: int) -> Iterator[int]:
+        """The file's descriptor; raises OSError unless it is a plain file of our own: others may put theirs there."""
+        file = os.open(self._path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+        try:
+            state = os.fstat(file)
+            if not stat.S_ISREG(state.st_mode) or state.st_uid != os.getuid():
+                raise OSError(f"{self._path} is not a file of our own")
+            yield file
+        finally:
+            os.close(file)
 
     async def hold_off(self) -> float:
         """Wait if need be; how long it was."""

@@ -62,6 +62,10 @@ class Resident:
         self._naks = Rarely()
         self._asked: dict[str, _Asked] = {}
 
+    def settling(self, settling_s: Callable[[], float]) -> None:
+        """As `Calling.settling_s`."""
+        self._calling.settling_s = settling_s
+
     # exchange.Resident
 
     def answer(self, frame: Frame, way: Way, now: float) -> None:

@@ -88,3 +88,13 @@ def test_the_file_is_ours_alone(tmp_path: Path) -> None:
     [file] = tmp_path.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
     assert str(os.getuid()) in file.name
+
+
+def test_a_pipe_that_somebody_laid_in_its_place_holds_nobody_up(tmp_path: Path) -> None:
+    alive = LastAlive("base", tmp_path)
+    alive.note()
+    [file] = tmp_path.iterdir()
+    file.unlink()
+    os.mkfifo(file)
+    alive.note()
+    assert alive.rest_s() == 0

@@ -27,10 +27,10 @@ from pydantic import ValidationError
 from psiu_broker.bus.hang_up import hang_up
 from psiu_broker.bus.keys import Keys, chunk, robot, robot_chunk, text
 from psiu_broker.bus.session import JSON, Declared, Session, aside, plain
-from psiu_broker.frame import Address
+from psiu_broker.frame import EVERYONE, Address
 from psiu_broker.mesh.beat import Beat, Notice
 from psiu_broker.mesh.mesh import Mesh
-from psiu_broker.routing.claims import Claim
+from psiu_broker.routing.claims import BEST, TERM_MAX, Claim
 from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE
 
 logger = logging.getLogger(__name__)
@@ -67,6 +67,7 @@ class ZenohMesh:
         self._worker: Executor = session.worker("mesh")
         self._twice: set[str] = set()
         """Whom two links lead to, as was told once: Zenoh may keep half of one (its issue 2806)."""
+        self._closed = False
         self._anew: asyncio.Task[None] | None = None
 
     @classmethod
@@ -76,6 +77,7 @@ class ZenohMesh:
         Raises:
             BusError: the session is closed or lost.
         """
+        mesh.detach(time.monotonic())
         bus = cls(session, keys, own, mesh)
         root, me, zenoh_session = bus._root, chunk(own), session.zenoh
         ring = zenoh.handlers.RingChannel
@@ -88,19 +90,21 @@ class ZenohMesh:
         def watch(what: str) -> Callable[[], Any]:
             return lambda: zenoh_session.liveliness().declare_subscriber(f"{root}/{what}", ring(RING), history=True)
 
-        now = time.monotonic
+        def told(hear: Callable[[Any, float], None]) -> Callable[[Any], None]:
+            """For the loop: what an earlier session still brings is nothing any more."""
+            return lambda it: None if bus._closed else hear(it, time.monotonic())
+
         await session.serve(
-            subscribe(f"frame/{me}/*/*", RING), bus._frame, lambda it: mesh.frame_came(*it, now()), name="mesh-frames"
+            subscribe(f"frame/{me}/*/*", RING),
+            bus._frame,
+            told(lambda it, now: mesh.frame_came(it[0], it[1], it[2], now)),
+            name="mesh-frames",
         )
-        await session.serve(
-            subscribe(f"notice/{me}", TALK_RING), _notice, lambda it: mesh.notice_came(it, now()), name="mesh-notices"
-        )
-        await session.serve(
-            subscribe("beat/*", TALK_RING), _beat, lambda it: mesh.beat_came(it, now()), name="mesh-beats"
-        )
-        await session.serve(watch("broker/**"), bus._broker_token, lambda it: it(now()), name="mesh-brokers")
-        await session.serve(watch("robot/**"), bus._robot_token, lambda it: it(now()), name="mesh-robots")
-        mesh.attach(bus, now(), time.time_ns())
+        await session.serve(subscribe(f"notice/{me}", TALK_RING), _notice, told(mesh.notice_came), name="mesh-notices")
+        await session.serve(subscribe("beat/*", TALK_RING), _beat, told(mesh.beat_came), name="mesh-beats")
+        await session.serve(watch("broker/**"), bus._broker_token, told(lambda it, now: it(now)), name="mesh-brokers")
+        await session.serve(watch("robot/**"), bus._robot_token, told(lambda it, now: it(now)), name="mesh-robots")
+        mesh.attach(bus, time.monotonic(), time.time_ns())
         return bus
 
     # mesh.MeshBus
@@ -141,7 +145,11 @@ class ZenohMesh:
 
         try:
             links = await aside(ids)
-        except zenoh.ZError as error:
+        except BaseException as error:
+            if isinstance(error, asyncio.CancelledError) or not (
+                isinstance(error, Exception) or self._session.panicked(error)
+            ):
+                raise
             logger.debug("the session cannot tell its links: %s", plain(error))
             return
         self.linked = frozenset(links)
@@ -153,7 +161,8 @@ class ZenohMesh:
                 )
 
     async def close(self) -> None:
-        """Nothing more is declared; before `Session.close`."""
+        """Nothing more is declared or heard; before `Session.close`."""
+        self._closed = True
         self._mesh.detach(time.monotonic())
         if self._anew is not None:
             self._anew.cancel()
@@ -225,7 +234,7 @@ class ZenohMesh:
         chunks = self._chunks(str(sample.key_expr), 4)
         if chunks is None:
             return None
-        name, epoch, zenoh_id = text(chunks[0]), int(chunks[1]), chunks[2]
+        name, epoch, zenoh_id = _broker_name(chunks[0]), _number_below(chunks[1], 2**64), chunks[2]
         edition = chunks[3]
         if sample.kind == zenoh.SampleKind.PUT:
             return lambda now: self._mesh.broker_came(name, epoch, zenoh_id, edition, now)
@@ -241,11 +250,11 @@ class ZenohMesh:
             None if number == NONE else _number(number),
             text(protocol),
             text(link),
-            int(term),
-            min(max(int(quality), 0), 10),
-            None if age == NONE else int(age),
+            _number_below(term, TERM_MAX),
+            _number_below(quality, BEST + 1),
+            None if age == NONE else _number_below(age, TERM_MAX),
         )
-        broker, life = text(owner), int(epoch)
+        broker, life = _broker_name(owner), _number_below(epoch, 2**64)
         if sample.kind == zenoh.SampleKind.PUT:
             return lambda now: self._mesh.claimed(broker, life, claim, now)
         return lambda now: self._mesh.unclaimed(broker, life, claim, now)
@@ -268,6 +277,20 @@ class ZenohMesh:
 
 
 _LANES: Final = frozenset(str(lane) for lane in PRIORITIES)
+
+
+def _number_below(chunk: str, end: int) -> int:
+    """A number as a key's chunk; raises ValueError for any other text, or one that is too great."""
+    if len(chunk) > 20 or not (chunk.isascii() and chunk.isdigit()) or int(chunk) >= end:
+        raise ValueError(f"{chunk[:30]} is not a number below {end}")
+    return int(chunk)
+
+
+def _broker_name(chunk: str) -> str:
+    name = text(chunk)
+    if not name or len(name) > 255 or name == str(EVERYONE):
+        raise ValueError("a broker has a name")
+    return name
 
 
 def _number(chunk: str) -> Address:

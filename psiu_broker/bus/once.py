@@ -5,6 +5,7 @@ of `Client` carry an id. A call without one, from a program in plain Zenoh, is t
 by its words, for a moment and only where routers relay.
 """
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Final
@@ -17,21 +18,24 @@ CAPACITY: Final = 16_384
 
 
 class Once:
-    """Remembers the calls of the last `KEPT_S`. For one thread."""
+    """Remembers the calls of the last `KEPT_S`. For any thread."""
 
     def __init__(self, *, relayed: bool, clock: Callable[[], float] = time.monotonic) -> None:
         """`relayed`: routers stand between us and programs."""
         self._relayed = relayed
         self._clock = clock
         self._seen: dict[bytes, float] = {}
+        self._lock = threading.Lock()
 
     def is_double(self, call_id: bytes, key: str, payload: bytes) -> bool:
         """Whether this call came before; an empty `call_id` means that it has none."""
         now = self._clock()
-        self._forget(now)
-        if call_id and len(call_id) <= ID_MAX:
-            return self._came_before(b"id:" + call_id, now, KEPT_S)
-        return self._relayed and self._came_before(b"\0".join((b"words:", key.encode(), payload)), now, SAME_WORDS_S)
+        with self._lock:
+            self._forget(now)
+            if call_id and len(call_id) <= ID_MAX:
+                return self._came_before(b"id:" + call_id, now, KEPT_S)
+            words = b"\0".join((b"words:", key.encode(), payload))
+            return self._relayed and self._came_before(words, now, SAME_WORDS_S)
 
     def _came_before(self, what: bytes, now: float, within_s: float) -> bool:
         at = self._seen.get(what)

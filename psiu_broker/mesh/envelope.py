@@ -49,17 +49,20 @@ def pack(envelope: Envelope) -> bytes:
     words = _MARK.join(texts).encode("utf-8", "surrogatepass")
     if len(words) + len(frame.payload) > LONGEST:
         raise EncodeError(f"a frame of {len(frame.payload)} bytes is too long for another broker")
-    header = _HEADER.pack(
-        VERSION,
-        envelope.epoch,
-        envelope.to_epoch,
-        envelope.sequence,
-        envelope.sent_us,
-        min(max(envelope.age_ms, 0), 0xFFFFFFFF),
-        source.number,
-        destination.number,
-        len(words),
-    )
+    try:
+        header = _HEADER.pack(
+            VERSION,
+            envelope.epoch,
+            envelope.to_epoch,
+            envelope.sequence,
+            envelope.sent_us,
+            min(max(envelope.age_ms, 0), 0xFFFFFFFF),
+            source.number,
+            destination.number,
+            len(words),
+        )
+    except struct.error as error:
+        raise EncodeError(f"an envelope cannot say this: {error}") from error
     return header + words + frame.payload
 
 

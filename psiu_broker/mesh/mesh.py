@@ -35,6 +35,8 @@ ORPHANED_S: Final = 1.0
 ANEW_EVERY_S: Final = 1.5
 ASKED_S: Final = 2 * ANEW_EVERY_S
 """How long a broker that is asked to declare anew may take until that is seen."""
+SILENT: Final = "announced and silent"
+CUT_ALL_MAX: Final = 2
 HANG_UP_EVERY_S: Final = 8.0
 """Ending every link is for what nothing else mends."""
 ASLEEP_S: Final = 1.0
@@ -44,6 +46,11 @@ FULL_EVERY: Final = 2
 DIFFERS_S: Final = 1.0
 NAMESAKE_S: Final = 3.0
 """A broker of our name that is announced for longer than this is no former life of ours."""
+BROKERS_MAX: Final = 1024
+NAMESAKES_MAX: Final = 64
+EDITIONS_MAX: Final = 16
+CLAIMS_MAX: Final = 4096
+"""Of one broker."""
 STRANGERS_MAX: Final = 256
 FORMER_MAX: Final = 1024
 
@@ -74,7 +81,10 @@ class Tokens:
 
     def add(self, claim: Claim) -> None:
         self._digest = None
-        self._claims.setdefault(claim.robot, []).append((self._round, claim))
+        if claim.robot in self._claims or len(self._claims) < CLAIMS_MAX:
+            held = self._claims.setdefault(claim.robot, [])
+            if len(held) < EDITIONS_MAX:
+                held.append((self._round, claim))
 
     def remove(self, claim: Claim) -> Claim | None:
         """The claim that the broker still has for the robot."""
@@ -150,6 +160,14 @@ class _Life:
         """Its announcements: two for a moment while it declares everything anew."""
 
 
+class _Namesake:
+    """Another broker with our name."""
+
+    def __init__(self, since: float) -> None:
+        self.since = since
+        self.editions: set[str] = set()
+
+
 class _Stranger:
     """A broker that is heard and not announced."""
 
@@ -216,8 +234,8 @@ class Mesh:
         self.neighbours = neighbours
         self.epoch = 0
         self.declared_anew = 0
-        self.namesakes: dict[int, float] = {}
-        """Other brokers with our name: their epochs, and since when."""
+        self.namesakes: dict[int, _Namesake] = {}
+        """Other brokers with our name, by their epochs."""
         self._hub = hub
         self._router = router
         self._quality = quality
@@ -235,6 +253,7 @@ class Mesh:
         """Robots that nobody owns any more: who did last, and until when."""
         self._strangers: dict[str, _Stranger] = {}
         self._beats = 0
+        self._beat_soon = False
         self._beaten = -inf
         self._awake_since = -inf
         self._hung_up_at = -inf
@@ -250,7 +269,6 @@ class Mesh:
         self._attached = True
         self.epoch = secrets.randbits(62) if epoch is None else epoch
         self._anew_wanted = None
-        self._former.clear()
         self._anew_at = now
         bus.announce(self.epoch)
         self.tick(now)
@@ -263,6 +281,7 @@ class Mesh:
             self._lose(neighbour, now)
         for robot in self.claims.of(self.own):
             self.claims.remove(self.own, robot)
+        self._former.clear()
         self._announced.clear()
         self._tokens.clear()
         self._orphans.clear()
@@ -296,11 +315,14 @@ class Mesh:
     def broker_came(self, name: str, epoch: int, zenoh_id: str, edition: str, now: float) -> None:
         """A broker is announced; `edition` tells its announcements apart where there is more than one."""
         if name == self.own:
-            if epoch != self.epoch:
-                self.namesakes[epoch] = now
+            if epoch != self.epoch and (epoch in self.namesakes or len(self.namesakes) < NAMESAKES_MAX):
+                self.namesakes.setdefault(epoch, _Namesake(now)).editions.add(edition)
+            return
+        if name not in self._announced and len(self._announced) >= BROKERS_MAX:
             return
         life = self._announced.setdefault(name, {}).setdefault(epoch, _Life(zenoh_id))
-        life.editions.add(edition)
+        if len(life.editions) < EDITIONS_MAX:
+            life.editions.add(edition)
         known = self.neighbours.find(name)
         if known is None:
             self._begin(name, epoch, now)
@@ -323,12 +345,15 @@ class Mesh:
             if self.claims.set(name, claim):
                 self._settle(claim.robot, now)
         self._hub.neighbour_came(name)
-        self._beaten = -inf
+        self._beat_soon = True
         log.info("mesh: broker %s is there", name)
 
     def broker_went(self, name: str, epoch: int, edition: str, now: float) -> None:
         """An announcement is no more; with its last one the broker is gone."""
-        self.namesakes.pop(epoch, None)
+        if name == self.own and epoch in self.namesakes:
+            self.namesakes[epoch].editions.discard(edition)
+            if not self.namesakes[epoch].editions:
+                del self.namesakes[epoch]
         lives = self._announced.get(name, {})
         life = lives.get(epoch)
         if life is None:
@@ -464,7 +489,8 @@ class Mesh:
         if not all(neighbour.alive(now) for neighbour in self.neighbours):
             for robot in self.ownership.abandoned(now):
                 self._take(robot, now)
-        if now - self._beaten >= BEAT_S:
+        if self._beat_soon or now - self._beaten >= BEAT_S:
+            self._beat_soon = False
             if now - self._beaten > ASLEEP_S:
                 self._awake_since = now
             self._beaten = now
@@ -480,9 +506,14 @@ class Mesh:
         for conflict in self.ownership.conflicts.values():
             detail = "robots of this name talk at each of these brokers by turns; rename one of them"
             yield str(conflict.robot), conflict.brokers, conflict.since, detail
-        for since in self.namesakes.values():
-            if now - since > NAMESAKE_S:
-                yield self.own, {self.own}, since, "another broker has this name too; rename one of them in [broker]"
+        for namesake in self.namesakes.values():
+            if now - namesake.since > NAMESAKE_S:
+                yield (
+                    self.own,
+                    {self.own},
+                    namesake.since,
+                    "another broker has this name too; rename one of them in [broker]",
+                )
 
     # Inside.
 
@@ -651,9 +682,7 @@ class Mesh:
             if trouble is None:
                 neighbour.remedy.over()
             elif neighbour.remedy.is_due(now):
-                self._remedy(
-                    neighbour.name, neighbour.zenoh_id, neighbour.remedy.steps, f"announced and {trouble}", now
-                )
+                self._remedy(neighbour.name, neighbour.zenoh_id, neighbour.remedy, f"announced and {trouble}", now)
                 if trouble == "unclear":
                     self._differs(neighbour, now)
         for stranger in list(self._strangers.values()):
@@ -661,9 +690,7 @@ class Mesh:
                 del self._strangers[stranger.name]
             elif now - stranger.since > NEWCOMER_S and stranger.remedy.is_due(now):
                 self._ask_anew(stranger.name)
-                self._remedy(
-                    stranger.name, stranger.zenoh_id, stranger.remedy.steps - 1, "heard and not announced", now
-                )
+                self._remedy(stranger.name, stranger.zenoh_id, stranger.remedy, "heard and not announced", now)
 
     def _trouble(self, neighbour: Neighbour, now: float) -> Trouble | None:
         patience_s = SILENT_S if neighbour.beat_at is not None else NEWCOMER_S
@@ -675,17 +702,23 @@ class Mesh:
             return "unclear"
         return None
 
-    def _remedy(self, name: str, zenoh_id: str, step: int, trouble: str, now: float) -> None:
+    def _remedy(self, name: str, zenoh_id: str, remedy: Remedy, trouble: str, now: float) -> None:
         """Do more each time against the same trouble with a broker: declare anew, then connect anew.
 
-        In steps, because each remedy is itself a trouble for others for a moment.
+        In steps, because each remedy is itself a trouble for others for a moment; the last one, which
+        ends every link, is for a broker that is announced and silent, and for twice at most.
         """
-        if 1 <= step <= 2:
+        if remedy.steps <= 2:
             self._declare_anew(now, f"{name} is {trouble}")
-        elif step > 2 and zenoh_id in self._bus.linked:
+        elif zenoh_id in self._bus.linked:
             log.warning("mesh: connecting anew: %s is %s", name, trouble)
             self._bus.hang_up(zenoh_id)
-        elif step > 3 and now - self._hung_up_at >= HANG_UP_EVERY_S * random.uniform(1, 2):  # noqa: S311
+        elif (
+            trouble == SILENT
+            and remedy.cut_all < CUT_ALL_MAX
+            and now - self._hung_up_at >= HANG_UP_EVERY_S * random.uniform(1, 2)  # noqa: S311 - spreads, no secret
+        ):
+            remedy.cut_all += 1
             self._hung_up_at = now
             log.warning("mesh: connecting anew with everybody: %s is %s", name, trouble)
             self._bus.hang_up(None)

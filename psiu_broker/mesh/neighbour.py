@@ -7,6 +7,7 @@ from typing import Final
 
 from psiu_broker.frame import MESH, Way
 from psiu_broker.mesh.beat import Beat
+from psiu_broker.routing.outbox import LANES
 from psiu_broker.routing.sequence import Sequence
 
 BEAT_S: Final = 0.4
@@ -24,10 +25,12 @@ ROUND_TRIPS: Final = 8
 class Remedy:
     """How far we have gone against a trouble with another broker."""
 
-    __slots__ = ("_at", "steps")
+    __slots__ = ("_at", "cut_all", "steps")
 
     def __init__(self) -> None:
         self.steps = 0
+        self.cut_all = 0
+        """How often every link was ended because of it."""
         self._at = -inf
 
     def is_due(self, now: float) -> bool:
@@ -39,7 +42,7 @@ class Remedy:
         return True
 
     def over(self) -> None:
-        self.steps = 0
+        self.steps = self.cut_all = 0
 
 
 class Neighbour:
@@ -100,7 +103,8 @@ class Neighbour:
         self._sent_us = beat.sent_us
         self._offsets.append(now - beat.sent_us / 1e6)
         for lane, count in beat.sent.get(own, {}).items():
-            self._series(lane).expect(count)
+            if lane in LANES:
+                self._series(lane).expect(count)
         if beat.heard is None:
             return
         echo = beat.heard.get(own)

@@ -16,6 +16,9 @@ AGES_S: Final = (0, 30, 120)
 Each change is a token to every broker: with a step of 5 s, 1000 robots that talk every 7 s made 560 a second at each.
 """
 
+TERM_MAX: Final = 2**53
+"""Terms are below; more changes of owner than this are no robot's."""
+
 BEST: Final = 10
 """The quality of a link on which every frame checked out."""
 
@@ -94,7 +97,7 @@ class Claims:
 
     def next_term(self, robot: Address) -> int:
         """Higher than that of any claim of this robot that was seen."""
-        return self._terms.get(robot, 0) + 1
+        return min(self._terms.get(robot, 0) + 1, TERM_MAX - 1)
 
     def _note_term(self, claim: Claim) -> None:
         term = max(self._terms.pop(claim.robot, 0), claim.term)

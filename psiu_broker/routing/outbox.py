@@ -12,6 +12,8 @@ STOP_LANE: Final = 0
 COMMAND_LANE: Final = 1
 QUESTION_LANE: Final = 2
 
+LANES: Final = frozenset({STOP_LANE, COMMAND_LANE, QUESTION_LANE})
+
 STOP_WORDS: Final = frozenset({"pare", "parar", "para", "stop"})
 """Command words that stop a robot, as `is_stop` knows them."""
 

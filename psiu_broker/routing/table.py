@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from psiu_broker.frame import Address, Way
+from psiu_broker.frame import MESH, Address, Way
 
 
 class Binding(NamedTuple):
@@ -154,11 +154,12 @@ class Table:
     def _may_join(self, number: Address, robot: Address) -> bool:
         """Whether `number` is free for the robot: nobody's, its own, or that of a robot not known by name before."""
         route = self.routes.get(number)
-        return route is None or route.robot in (robot, number)
+        return route is None or route.robot == robot or (route.robot == number and not route.pinned)
 
     def _make_room(self, now: float) -> None:
         if len(self.routes) >= self._capacity:
-            self._withdraw([next(route for route in self.routes.values() if not route.pinned)], now)
+            free = [route for route in self.routes.values() if not route.pinned]
+            self._withdraw([next((route for route in free if route.way.link == MESH), free[0])], now)
 
     def _enter(self, route: Route) -> None:
         for address in route.addresses:

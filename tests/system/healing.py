@@ -5,7 +5,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from system.events import Event
@@ -41,6 +41,8 @@ class Watch:
         self._lab = lab
         self._traffic = Traffic(lab)
         self._books: _Books | None = None
+        self.unequal: list[str] = []
+        """Frames between brokers that were not accounted for at last; a later beat may still do it."""
         self._doubles: set[str] = set()
 
     async def start(self) -> Healed:
@@ -50,6 +52,12 @@ class Watch:
 
     async def stop(self) -> None:
         await self._traffic.pause()
+
+    async def end(self) -> Healed:
+        """Once more amid traffic, without an event: now every frame must be accounted for."""
+        self._traffic.go()
+        end = await self._after("the end", time.monotonic(), HEALED_S, [])
+        return replace(end, faults=(*end.faults, *self.unequal))
 
     async def go_through(self, event: Event) -> Healed:
         """Let it happen amid traffic; wait until the mesh has healed, then until the books agree."""
@@ -120,11 +128,13 @@ class Watch:
         until = time.monotonic() + SETTLED_S
         while True:
             books = await _Books.of(self._lab)
-            faults = books.faults(self._lab, self._books)
-            if not faults or time.monotonic() > until:
+            faults = books.faults(self._lab)
+            self.unequal = [] if faults else books.unequal(self._lab, self._books)
+            if not (faults or self.unequal) or time.monotonic() > until:
                 break
             await asyncio.sleep(POLL_S)
-        self._books = books
+        if not self.unequal:
+            self._books = books
         return faults
 
     def _new_doubles(self) -> list[str]:
@@ -146,8 +156,8 @@ class _Books:
         answers = await asyncio.gather(*asked)
         return cls(answers[: len(lab.nodes)], answers[len(lab.nodes) :])
 
-    def faults(self, lab: Lab, before: "_Books | None") -> list[str]:
-        """What does not agree, in words. Frames between brokers are counted from `before` on."""
+    def faults(self, lab: Lab) -> list[str]:
+        """What does not agree, in words, frames between brokers aside."""
         names = [broker.name for broker in lab.brokers]
         owners = {robot.name: broker for robot, broker in zip(lab.robots, names, strict=True)}
         faults: list[str] = []
@@ -165,10 +175,11 @@ class _Books:
                 faults.append(f"{name} says that the other brokers are {others}")
             if mesh["conflicts"]:
                 faults.append(f"{name} sees conflicts: {mesh['conflicts']}")
-        return faults or self._unequal(names, before)
+        return faults
 
-    def _unequal(self, names: Sequence[str], before: "_Books | None") -> list[str]:
+    def unequal(self, lab: Lab, before: "_Books | None") -> list[str]:
         """The pairs, both of the same life as `before`, where one did not get, or miss, what the other sent."""
+        names = [broker.name for broker in lab.brokers]
         same = [node for node in range(len(names)) if before is None or self._is_same_life(node, before)]
         faults: list[str] = []
         for a, b in itertools.permutations(same, 2):

@@ -53,10 +53,13 @@ async def test_after_whatever_befalls_it_the_mesh_heals_within_five_seconds(topo
                         break
                     healed.append(await watch.go_through(draw(lab, chance)))
                     _tell(topology, number, healed[-1])
+                end = await watch.end()
             finally:
                 await watch.stop()
     print(figures(topology.name, healed))
-    faults = [f"{number}, {one.text}: {fault}" for number, one in enumerate([start, *healed]) for fault in one.faults]
+    faults = [
+        f"{number}, {one.text}: {fault}" for number, one in enumerate([start, *healed, end]) for fault in one.faults
+    ]
     report = "\n".join(faults)
     assert not faults, f"{topology.name}, PSIU_MESH_SEED={SEED}, logs in {tmp_path}:\n{report}"
 
