@@ -23,7 +23,10 @@ _PATH: Final = re.compile(r"unixsock-stream/(?P<path>[^?#]+)")
 def hang_up(links: Iterable[tuple[str, str]]) -> int:
     """Shut down the connections of this process with these endpoints, ours and theirs, as Zenoh names them.
 
-    Returns how many there were. Never raises.
+    Returns how many there were.
+
+    Raises:
+        OSError: what files are open cannot be told: there are too many.
     """
     wanted = {
         (own, far) for ours, theirs in links if (own := _name(ours)) is not None and (far := _name(theirs)) is not None
