@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 Micros = Annotated[int, Field(ge=0, lt=2**63)]
+Epoch = Annotated[int, Field(ge=0, lt=2**64)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 
@@ -24,8 +25,10 @@ class Beat(BaseModel):
         max_length=4096,
         description="for each broker the `sent_us` of its last beat, and how long ago that came; not in every beat",
     )
-    sent: dict[str, dict[int, Count]] = Field(
-        default={}, max_length=4096, description="how many frames each broker was sent, by lane; not in every beat"
+    sent: dict[str, tuple[Epoch, dict[int, Count]]] = Field(
+        default={},
+        max_length=4096,
+        description="how many frames each broker, in which life of its, was sent, by lane; not in every beat",
     )
     claims: str = Field(default="", max_length=64, description="the digest of what the sender claims")
     unseen: list[str] = Field(

@@ -427,7 +427,7 @@ class Mesh:
         self._strangers.pop(beat.broker, None)
         if self.own in beat.unseen:
             self._declare_anew(now, f"{beat.broker} does not see all of it")
-        neighbour.beat(beat, self.own, now)
+        neighbour.beat(beat, self.own, self.epoch, now)
         if beat.claims == self._tokens_of(beat.broker, beat.epoch).digest:
             neighbour.differs_since = None
         elif neighbour.differs_since is None:
@@ -533,7 +533,7 @@ class Mesh:
         )
         if self._beats % FULL_EVERY == 0:
             heard = {each.name: echo for each in self.neighbours if (echo := each.echo(now)) is not None}
-            sent = {each.name: each.sent for each in self.neighbours if each.sent}
+            sent = {each.name: (each.epoch, each.sent) for each in self.neighbours if each.sent}
             beat = beat.model_copy(update={"heard": heard, "sent": sent})
         self._bus.put_beat(beat)
 

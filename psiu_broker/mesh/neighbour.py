@@ -97,14 +97,15 @@ class Neighbour:
         self.beat_at = self.deaf_since = self.differs_since = None
         self._offsets.clear()  # its clock stands still while it sleeps
 
-    def beat(self, beat: Beat, own: str, now: float) -> None:
-        """Note a beat that came now."""
+    def beat(self, beat: Beat, own: str, own_epoch: int, now: float) -> None:
+        """Note a beat that came now to the broker `own` in its life `own_epoch`."""
         self.beat_at = now
         self._sent_us = beat.sent_us
         self._offsets.append(now - beat.sent_us / 1e6)
-        for lane, count in beat.sent.get(own, {}).items():
-            if lane in LANES:
-                self._series(lane).expect(count)
+        meant_for, counts = beat.sent.get(own, (own_epoch, {}))
+        if meant_for == own_epoch:
+            for lane in LANES & counts.keys():
+                self._series(lane).expect(counts[lane])
         if beat.heard is None:
             return
         echo = beat.heard.get(own)

@@ -20,7 +20,7 @@ def neighbour() -> Neighbour:
     neighbour = Neighbour("B", 7, "zid", 100.0)
     for number in range(10):
         sent = 100 + number * BEAT_S
-        neighbour.beat(beat(FAR_S + sent), "A", sent + 0.002)
+        neighbour.beat(beat(FAR_S + sent), "A", 0, sent + 0.002)
     return neighbour
 
 
@@ -40,7 +40,7 @@ def test_a_frame_that_stood_still_on_its_way_is_as_late_as_that(neighbour: Neigh
 
 def test_beats_that_were_held_back_do_not_make_a_frame_seem_quick(neighbour: Neighbour) -> None:
     for number in range(30):
-        neighbour.beat(beat(FAR_S + 104 + number * BEAT_S), "A", 107 + number * BEAT_S)
+        neighbour.beat(beat(FAR_S + 104 + number * BEAT_S), "A", 0, 107 + number * BEAT_S)
     assert late_s(neighbour, 116.0, 119.0) == pytest.approx(2.998, abs=1e-3)
 
 
@@ -50,22 +50,22 @@ def test_before_the_first_beat_nothing_is_known_to_be_late() -> None:
 
 def test_a_clock_that_stood_still_while_its_broker_slept_counts_anew(neighbour: Neighbour) -> None:
     neighbour.returned(3700.0)
-    neighbour.beat(beat(FAR_S + 104), "A", 3700.502)
+    neighbour.beat(beat(FAR_S + 104), "A", 0, 3700.502)
     assert late_s(neighbour, 104.1, 3700.602) == pytest.approx(0, abs=1e-4)
 
 
 def test_the_round_trip_is_measured_by_our_own_clock(neighbour: Neighbour) -> None:
     """Our beat left at 104.0; B held its answer back for 0.3 s; the whole took 0.31 s."""
     assert neighbour.round_trip_s is None
-    neighbour.beat(beat(FAR_S + 104.305, {"A": (104_000_000, 300_000)}), "A", 104.310)
+    neighbour.beat(beat(FAR_S + 104.305, {"A": (104_000_000, 300_000)}), "A", 0, 104.310)
     assert neighbour.round_trip_s == pytest.approx(0.010)
-    neighbour.beat(beat(FAR_S + 104.8, {"A": (104_400_000, 300_000)}), "A", 104.8)
+    neighbour.beat(beat(FAR_S + 104.8, {"A": (104_400_000, 300_000)}), "A", 0, 104.8)
     assert neighbour.round_trip_s == pytest.approx(0.010), "the quickest of the last few"
 
 
 @pytest.mark.parametrize("echo", [(2**62, 0), (0, 0), (104_000_000, 2**62)])
 def test_an_echo_that_cannot_be_is_no_round_trip(neighbour: Neighbour, echo: tuple[int, int]) -> None:
-    neighbour.beat(beat(FAR_S + 104.3, {"A": echo}), "A", 104.31)
+    neighbour.beat(beat(FAR_S + 104.3, {"A": echo}), "A", 0, 104.31)
     assert neighbour.round_trip_s is None
 
 
@@ -76,9 +76,9 @@ def test_our_own_beat_says_when_we_heard_it(neighbour: Neighbour) -> None:
 
 def test_a_broker_that_does_not_mention_us_is_deaf_until_it_does(neighbour: Neighbour) -> None:
     assert neighbour.deaf_since == pytest.approx(100.002)
-    neighbour.beat(beat(FAR_S + 105, {"A": (104_000_000, 0)}), "A", 105.0)
+    neighbour.beat(beat(FAR_S + 105, {"A": (104_000_000, 0)}), "A", 0, 105.0)
     assert neighbour.deaf_since is None
-    neighbour.beat(beat(FAR_S + 105.4), "A", 105.4)
+    neighbour.beat(beat(FAR_S + 105.4), "A", 0, 105.4)
     assert neighbour.deaf_since == 105.4
 
 
@@ -89,7 +89,7 @@ def test_a_broker_is_alive_while_its_beats_come() -> None:
     known.add(neighbour)
     assert known.alive("B", 0.8), "it came a moment ago"
     assert not known.alive("B", 2 * ALIVE_S)
-    neighbour.beat(beat(1), "A", 2.0)
+    neighbour.beat(beat(1), "A", 0, 2.0)
     assert known.alive("B", 2 + 2 * BEAT_S), "one beat may be lost"
     known.remove("B")
     assert not known.alive("B", 2.0)
@@ -120,5 +120,21 @@ def test_the_series_of_each_lane_go_on_when_a_broker_was_only_out_of_sight(neigh
 def test_no_frame_is_early(beats: list[tuple[float, float]], sent: float, now: float) -> None:
     neighbour = Neighbour("B", 7, "zid", 0.0)
     for sent_at, came in beats:
-        neighbour.beat(beat(sent_at), "A", came)
+        neighbour.beat(beat(sent_at), "A", 0, came)
     assert neighbour.late_s(int(sent * 1e6), now) >= 0
+
+
+def test_frames_that_were_sent_and_never_came_are_missed_at_the_next_beat() -> None:
+    neighbour = Neighbour("B", 7, "id", 0.0)
+    neighbour.take(1, 1)
+    said = Beat(broker="B", epoch=7, sent_us=1, heard={}, sent={"A": (5, {1: 4, 9: 100})})
+    neighbour.beat(said, "A", 5, 1.0)
+    assert (neighbour.frames_in, neighbour.lost) == (1, 3)
+    assert neighbour.take(1, 3)  # late after all
+    assert (neighbour.frames_in, neighbour.lost) == (2, 2)
+
+
+def test_what_was_sent_to_a_former_life_of_ours_is_not_missed() -> None:
+    neighbour = Neighbour("B", 7, "id", 0.0)
+    neighbour.beat(Beat(broker="B", epoch=7, sent_us=1, heard={}, sent={"A": (4, {1: 500})}), "A", 5, 1.0)
+    assert neighbour.lost == 0
