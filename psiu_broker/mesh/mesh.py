@@ -444,6 +444,8 @@ class Mesh:
         neighbour = self.neighbours.find(notice.broker)
         if envelope is None or neighbour is None:
             return
+        if (envelope.epoch, envelope.to_epoch) != (neighbour.epoch, self.epoch):
+            return  # of a former life
         route = self._router.find(envelope.frame.source)
         if route is None or self.claims.find(self.own, route.robot) is None:
             return
