@@ -292,6 +292,21 @@ async def test_a_robot_on_one_radio_with_two_brokers_has_one_owner_and_is_told_a
     assert not net.brokers[0].mesh_seen().conflicts
 
 
+async def test_a_robot_that_two_brokers_find_at_once_is_commanded_by_one_of_them(net: Net) -> None:
+    mnerim, beta = await net.rover("MNERIM", 1), await net.rover("BETA", 2)
+    for name in ("GAMA", "DELTA"):
+        robot = await Rover(name, net.wifi[0], net.wifi[1]).open()
+        net.rovers.append(robot)
+        mnerim.heard.clear()
+        beta.heard.clear()
+        called = asyncio.create_task(net.call(3, name, "parafrente", 7))
+        await until(lambda: "qualseunome B1" in mnerim.heard and "qualseunome B2" in beta.heard)
+        robot.says("B1", "vivo")
+        assert (await called).status == "sucesso"
+        commands = [words for words in robot.heard if words.startswith("parafrente")]
+        assert commands in (["parafrente 7 B1"], ["parafrente 7 B2"])
+
+
 async def test_two_robots_of_one_name_are_shown_as_a_conflict(net: Net) -> None:
     first = await net.rover("MNERIM", 1)
     second = await Rover("MNERIM", net.wifi[1]).open()

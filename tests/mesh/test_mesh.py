@@ -461,6 +461,21 @@ def test_a_lost_notice_of_a_single_frame_is_repeated(mesh: Simulation) -> None:
     assert mesh.owner("MNERIM") == "B"
 
 
+@pytest.mark.parametrize("reborn", "AB")
+def test_a_notice_from_or_for_a_former_life_gives_no_robot_away(mesh: Simulation, reborn: str) -> None:
+    """It comes when the robot is back at A, whose session or the teller's is another by then."""
+    mesh.delay_of["notice"] = 3.0
+    mesh.says("MNERIM", "B", "PC", "cheguei")
+    del mesh.delay_of["notice"]
+    mesh.reopen(reborn)
+    mesh.talks("MNERIM", "A", 2)
+    assert mesh.owner("MNERIM") == "A"
+    until = mesh.now + 4
+    while mesh.now < until:
+        mesh.run(0.1)
+        assert mesh.owners("MNERIM") == {"A": "A", "B": "A", "C": "A"}
+
+
 def test_a_broker_that_nobody_sees_announces_itself_anew() -> None:
     mesh = Simulation("AB")
     mesh.run(2)
