@@ -1,26 +1,33 @@
-"""The broker: puts the parts together, starts them, watches them, and stops them."""
+"""The broker: puts the parts together, starts them, watches them, and stops them.
+
+What is wired to what:
+
+    Link, Mesh   -- a frame -->                          Exchange
+    Exchange     -- where to? -->                        Router       -- whose robot is it? -->  Ownership
+    Exchange     -- for us, or in another protocol -->   Resident
+    Exchange     -- what robots say -->                  Bus.publisher
+    Router       -- a robot came, or went -->            Broker       -->  codecs' directories, Mesh, Resident, cards
+    Ownership    -- heard a robot of another broker -->  Broker       -->  Mesh
+    Bus          -- a call -->                           Broker       -->  Resident
+    Bus          -- a trace -->                          Broker       -->  Tracing  -->  Resident, or Bus.traces
+    Bus          -- a question -->                       Broker       -->  Report
+"""
 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from math import inf
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from psiu_broker import __version__
-from psiu_broker.bus.calls import Calls
-from psiu_broker.bus.keys import Keys
-from psiu_broker.bus.mesh import ZenohMesh
-from psiu_broker.bus.publisher import Publisher
-from psiu_broker.bus.queries import Queries
-from psiu_broker.bus.round_trip import RoundTrip
-from psiu_broker.bus.session import Session, plain
-from psiu_broker.bus.traces import Traces
+from psiu_broker.bus.bus import Bus
 from psiu_broker.codecs import CODECS
-from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.directories import Directories
 from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config import Configuration, LinkConfiguration, TrunkConfiguration
+from psiu_broker.config import Configuration, LinkConfiguration
+from psiu_broker.config.shown import shown
+from psiu_broker.config.who import bindings, own_addresses
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange, NoBus
 from psiu_broker.frame import MESH, Address, Frame, Way
@@ -28,12 +35,13 @@ from psiu_broker.hold_off import LastAlive
 from psiu_broker.link import Link
 from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
 from psiu_broker.mesh.neighbour import Neighbours
+from psiu_broker.mesh.probe import Probed
 from psiu_broker.mesh.quality import Qualities
 from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Trace, Why
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
-from psiu_broker.profiles import Node, describe
+from psiu_broker.pulse import Pulse
 from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
 from psiu_broker.routing import table
@@ -43,16 +51,12 @@ from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.router import SELF, Router
 from psiu_broker.routing.verdicts import Verdict
 from psiu_broker.tracing import Tracing
-from psiu_broker.trunk import Endpoints, Trunks
+from psiu_broker.trunk import Trunks
 
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.1
 """How often what is too late is dropped and cards that changed are put."""
-STOOD_STILL_S: Final = 1.0
-"""A pause between ticks that is no mere load: the process was stopped, or the computer slept."""
-STALE_S: Final = 0.3
-"""How long after that calls may still come that had waited meanwhile."""
 SETTLING_S: Final = 0.3
 LOOK_AROUND_S: Final = 2.0
 ALIVE_EVERY_S: Final = 0.25
@@ -70,48 +74,39 @@ class Broker:
     def __init__(self, configuration: Configuration) -> None:
         self.configuration = configuration
         self.started = time.time()
-        self._own_name = Address.named(configuration.broker.name)
-        self._directories: dict[str, Directory] = {}
-        bindings = tuple(
-            table.Binding(Address.named(robot.name), robot.address, Way(robot.link, robot.peer), robot.protocol)
-            for robot in configuration.robots.values()
-        )
+        name = configuration.broker.name
+        self._directories = Directories()
         slowest_s = max((link.options.max_age_s for link in configuration.links.values()), default=0.0)
         duplicates = Duplicates(slowest_s + DOUBLES_MARGIN_S)
         neighbours = Neighbours()
-        self._ownership = Ownership(
-            configuration.broker.name, neighbours.alive, duplicates.heard_here, self._heard_of_another
-        )
+        self._ownership = Ownership(name, neighbours.alive, duplicates.heard_here, self._heard_of_another)
         router = Router(
-            self._own_addresses(),
-            bindings,
+            own_addresses(configuration),
+            bindings(configuration),
             identity,
             self._robot_heard,
             self._robot_gone,
             duplicates,
             self._ownership,
         )
-        self.exchange = Exchange(self._own_name, router)
+        self.exchange = Exchange(Address.named(name), router)
         self._qualities = Qualities()
-        self.mesh = Mesh(
-            configuration.broker.name, self, router, self._ownership, neighbours, self._qualities.of, identity
-        )
+        self.mesh = Mesh(name, self, router, self._ownership, neighbours, self._qualities.of, identity)
         self.exchange.join(self.mesh, MAX_AGE_S)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
         self.resident.settling(lambda: SETTLING_S if neighbours.ways else 0.0)
-        self.tracing = Tracing(configuration.broker.name, self.exchange, self.resident.call, self._broker_of)
-        self._trunks = Trunks(configuration.broker.name, configuration.trunks.values())
-        self.report = Report(configuration.broker.name, self.exchange, self.resident.commands, self._trunks)
+        self.tracing = Tracing(name, self.exchange, self.resident.call, self._broker_of)
+        self._trunks = Trunks(name, configuration.trunks.values())
+        self.report = Report(name, self.exchange, self.resident.commands, self._trunks)
         for link in configuration.links.values():
             self.exchange.add(self._link(link))
-        for robot in router.robots():
-            self._list(robot)
-        self._last_alive = LastAlive(configuration.broker.name) if configuration.mesh.mode == "router" else None
+        for route in router.robots():
+            self._directories.add(route.addresses)
+        self._last_alive = LastAlive(name) if configuration.mesh.mode == "router" else None
         self._changed: dict[Address, table.Route] = {}
         self._seen: dict[str, float] = {}
-        self._ticked = time.monotonic()
-        self._stale_until = -inf
-        self._bus: _Bus | None = None
+        self._pulse = Pulse(time.monotonic())
+        self._bus: Bus | None = None
         self._bus_lost = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self._link_tasks: list[asyncio.Task[None]] = []
@@ -131,7 +126,7 @@ class Broker:
         except BaseException:
             self._trunks.close()
             raise
-        self._ticked = time.monotonic()
+        self._pulse = Pulse(time.monotonic())
         create = asyncio.get_running_loop().create_task
         self._tasks = [
             create(self._tick(), name="tick"),
@@ -146,9 +141,7 @@ class Broker:
     async def stop(self) -> None:
         """Refuse new calls, let what waits go out, close the links, then the bus."""
         if self._bus is not None:
-            await self._bus.calls.close()
-            await self._bus.traces.close()
-            await self._bus.mesh.close()
+            await self._bus.retire()
         await self.resident.close()
         try:
             async with asyncio.timeout(DRAIN_S):
@@ -168,7 +161,7 @@ class Broker:
         """Whether everything makes progress: the loop's ticks, every link's life, and the bus, asked through Zenoh."""
         return (await self._health()).healthy
 
-    # queries.Source
+    # bus.Served
 
     def status(self) -> Status:
         links = self.exchange.links.values()
@@ -205,22 +198,7 @@ class Broker:
         return Health(healthy=all(checks.values()), checks=checks)
 
     def config(self) -> Mapping[str, Any]:
-        configuration = self.configuration
-        return {
-            "broker": configuration.broker.model_dump(mode="json"),
-            "zenoh": configuration.zenoh.model_dump(mode="json"),
-            "mesh": configuration.mesh.model_dump(mode="json"),
-            "links": {name: _link_table(link) for name, link in configuration.links.items()},
-            "trunks": {name: _trunk_table(trunk) for name, trunk in configuration.trunks.items()},
-            "robots": {
-                robot.name: {
-                    "link": robot.link,
-                    "address": None if robot.address is None else robot.address.number,
-                    "nodes": {name: node.model_dump(mode="json") for name, node in robot.nodes.items()},
-                }
-                for robot in configuration.robots.values()
-            },
-        }
+        return shown(self.configuration)
 
     def mesh_seen(self) -> MeshMessage:
         mode, bus = self.configuration.mesh.mode, self._bus
@@ -239,43 +217,53 @@ class Broker:
     def cards(self) -> Mapping[Address, Card]:
         return self.report.cards()
 
-    # Inside: robots come and go.
+    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer | None:
+        """None: another broker has the robot, and answers."""
+        if self._is_elsewhere(robot):
+            return None
+        self._refuse_what_is_stale(command)
+        try:
+            answer = await self.resident.call(robot, command, request)
+        except CallError as error:
+            if error.code == "unknown_robot" and self._is_elsewhere(robot):
+                return None
+            raise
+        self._note(self.exchange.router.robots() if command == DISCOVER else ())
+        return answer
 
-    def _note(self, routes: Iterable[table.Route]) -> None:
-        """Their cards may have changed."""
-        self._changed.update({route.robot: route for route in routes})
+    async def send(self, robot: Address, command: str, request: CallRequest) -> None:
+        if not self._is_elsewhere(robot):
+            self._refuse_what_is_stale(command)
+            await self.resident.tell(robot, command, request)
 
-    def _robot_heard(self, route: table.Route) -> None:
-        self._list(route)
-        if route.way.link != MESH:
-            self._changed[route.robot] = route
-            self.mesh.robot_heard(route, time.monotonic())
-        else:
-            self._changed.pop(route.robot, None)
-            if self._bus is not None:
-                self._bus.publisher.forget_card(route.robot)
-        self.resident.robot_heard(route)
-        for address in route.addresses:
-            self.exchange.release(address, time.monotonic())
+    async def trace(self, a: Address, b: Address) -> Trace | None:
+        """None: `a` is not here."""
+        if self._bus is None or self.exchange.router.find(a) is None or self._is_elsewhere(a):
+            return None
+        return await self.tracing.trace(a, b, self._bus.traces.probe)
 
-    def _robot_gone(self, route: table.Route) -> None:
-        self._changed.pop(route.robot, None)
-        self.mesh.robot_gone(route)
-        self.resident.robot_gone(route)
-        for address in route.addresses:
-            directory = self._directory(address.domain)
-            directory.names.discard(address.name)
-            directory.numbers.discard(address.number)
-        if self._bus is not None:
-            self._bus.publisher.withdraw_card(route.robot)
+    async def probed(self, robot: Address) -> Probed:
+        return await self.tracing.probed(robot)
 
-    def _list(self, route: table.Route) -> None:
-        for address in route.addresses:
-            directory = self._directory(address.domain)
-            if address.is_numbered:
-                directory.numbers.add(address.number)
-            elif " " in address.name:
-                directory.names.add(address.name)
+    def _refuse_what_is_stale(self, command: str) -> None:
+        """Raise CallError for what came while the broker stood still: nobody knows how long it waited."""
+        if self._pulse.stale(time.monotonic()) and not is_stop(command):
+            raise CallError("expired", "the broker stood still for a while; nothing was sent")
+
+    def _is_elsewhere(self, robot: Address) -> bool:
+        """Whether another broker has the robot, and its calls."""
+        route = self.exchange.router.find(robot)
+        if route is None or route.way == SELF:
+            return False
+        return route.way.link == MESH or self._ownership.owner(route.robot) not in (
+            None,
+            self.configuration.broker.name,
+        )
+
+    def _broker_of(self, zenoh_id: str) -> str:
+        """The broker with that Zenoh id; the id where there is none."""
+        known = (each.name for each in self.mesh.neighbours if each.zenoh_id.lstrip("0") == zenoh_id)
+        return next(known, zenoh_id)
 
     # mesh.Hub
 
@@ -295,36 +283,50 @@ class Broker:
         if self._bus is not None:
             self._bus.publisher.delete_card(robot)
 
+    # Inside: robots come and go.
+
+    def _note(self, routes: Iterable[table.Route]) -> None:
+        """Their cards may have changed."""
+        self._changed.update({route.robot: route for route in routes})
+
+    def _robot_heard(self, route: table.Route) -> None:
+        self._directories.add(route.addresses)
+        if route.way.link != MESH:
+            self._changed[route.robot] = route
+            self.mesh.robot_heard(route, time.monotonic())
+        else:
+            self._changed.pop(route.robot, None)
+            if self._bus is not None:
+                self._bus.publisher.forget_card(route.robot)
+        self.resident.robot_heard(route)
+        for address in route.addresses:
+            self.exchange.release(address, time.monotonic())
+
+    def _robot_gone(self, route: table.Route) -> None:
+        self._changed.pop(route.robot, None)
+        self.mesh.robot_gone(route)
+        self.resident.robot_gone(route)
+        self._directories.remove(route.addresses)
+        if self._bus is not None:
+            self._bus.publisher.withdraw_card(route.robot)
+
     def _heard_of_another(self, owner: str, frame: Frame, way: Way) -> None:
         self.mesh.notify(owner, frame, way, time.monotonic())
 
     # Inside: putting together.
-
-    def _own_addresses(self) -> dict[Address, str]:
-        own = {self._own_name: "psiu-ascii"}
-        for link in self.configuration.links.values():
-            if isinstance(link.codec, PsiuHexa.Options):
-                own[Address.numbered(link.codec.local, link.codec.domain)] = "psiu-hexa"
-        return own
-
-    def _directory(self, domain: str) -> Directory:
-        directory = self._directories.get(domain)
-        if directory is None:
-            directory = self._directories[domain] = Directory()
-        return directory
 
     def _link(self, configuration: LinkConfiguration) -> Link:
         options = configuration.codec
         domain = options.domain if isinstance(options, PsiuHexa.Options) else ""
         unaddressed = isinstance(options, PsiuHexa.Options) and options.topology != "ad-hoc"
         codec = CODECS[configuration.protocol]
-        directory = self._directory(domain)
+        directory = self._directories.of(domain)
         return Link(configuration, lambda: codec(options, directory), self.exchange, unaddressed=unaddressed)
 
-    # Inside: the bus.
+    # Inside: the bus, opened and kept open.
 
     async def _open_bus(self) -> None:
-        self._bus = await _Bus.open(self, self._trunks.meet(), self._bus_lost.set)
+        self._bus = await Bus.open(self.configuration, self, self._bus_lost.set, *self._trunks.meet())
         self.exchange.bus = self._bus.publisher
         self._note(self.exchange.router.robots())
 
@@ -344,6 +346,8 @@ class Broker:
                 log.warning("the bus cannot be opened again: %s; trying on", trouble)
                 self._bus_lost.set()
                 await asyncio.sleep(REOPEN_S)
+
+    # Inside: what goes on by the clock.
 
     async def _tick(self) -> None:
         while True:
@@ -367,10 +371,9 @@ class Broker:
 
     def _look_after(self, now: float) -> None:
         """Drop what is too late, and put the cards that changed."""
-        if now - self._ticked > STOOD_STILL_S:
-            log.warning("stood still for %.1f s; calls that came meanwhile are refused", now - self._ticked)
-            self._stale_until = now + STALE_S
-        self._ticked = now
+        stood_still_s = self._pulse.beat(now)
+        if stood_still_s:
+            log.warning("stood still for %.1f s; calls that came meanwhile are refused", stood_still_s)
         self.exchange.expire(now)
         for link in self.exchange.links.values():
             self._qualities.count(link.name, link.frames_in, link.malformed)
@@ -386,7 +389,7 @@ class Broker:
     def _checks(self) -> dict[str, bool]:
         links = {task.get_name(): not task.done() for task in self._link_tasks}
         return {
-            "loop": time.monotonic() - self._ticked < 10 * TICK_S + ROUND_TRIP_S,
+            "loop": self._pulse.since_s(time.monotonic()) < 10 * TICK_S + ROUND_TRIP_S,
             "bus": self._bus is not None and not self._bus.session.is_lost,
             "ledger": self.report.ledger().balances,
             **links,
@@ -404,143 +407,3 @@ class Broker:
         if not all(checks.values()):
             log.error("not healthy: %s", ", ".join(name for name, good in checks.items() if not good))
         return Health(healthy=all(checks.values()), checks=checks)
-
-    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer | None:
-        """None: another broker has the robot, and answers."""
-        if self._is_elsewhere(robot):
-            return None
-        self._refuse_what_is_stale(command)
-        try:
-            answer = await self.resident.call(robot, command, request)
-        except CallError as error:
-            if error.code == "unknown_robot" and self._is_elsewhere(robot):
-                return None
-            raise
-        self._note(self.exchange.router.robots() if command == DISCOVER else ())
-        return answer
-
-    def names(self) -> Mapping[Address, Address]:
-        """What the configuration calls the numbers in it, our own among them."""
-        own = dict.fromkeys(self._own_addresses(), self._own_name)
-        robots = self.configuration.robots.values()
-        return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
-
-    async def trace(self, a: Address, b: Address) -> Trace | None:
-        """None: `a` is not here."""
-        if self._bus is None or self.exchange.router.find(a) is None or self._is_elsewhere(a):
-            return None
-        return await self.tracing.trace(a, b, self._bus.traces.probe)
-
-    def _broker_of(self, zenoh_id: str) -> str:
-        """The broker with that Zenoh id; the id where there is none."""
-        known = (each.name for each in self.mesh.neighbours if each.zenoh_id.lstrip("0") == zenoh_id)
-        return next(known, zenoh_id)
-
-    async def send(self, robot: Address, command: str, request: CallRequest) -> None:
-        if not self._is_elsewhere(robot):
-            self._refuse_what_is_stale(command)
-            await self.resident.tell(robot, command, request)
-
-    def _refuse_what_is_stale(self, command: str) -> None:
-        """Raise CallError for what came while the broker stood still: nobody knows how long it waited."""
-        now = time.monotonic()
-        stale = now < self._stale_until or now - self._ticked > STOOD_STILL_S
-        if stale and not is_stop(command):
-            raise CallError("expired", "the broker stood still for a while; nothing was sent")
-
-    def _is_elsewhere(self, robot: Address) -> bool:
-        """Whether another broker has the robot, and its calls."""
-        route = self.exchange.router.find(robot)
-        if route is None or route.way == SELF:
-            return False
-        return route.way.link == MESH or self._ownership.owner(route.robot) not in (
-            None,
-            self.configuration.broker.name,
-        )
-
-
-class _Bus:
-    """One session with everything that is declared on it."""
-
-    def __init__(
-        self,
-        session: Session,
-        publisher: Publisher,
-        mesh: ZenohMesh,
-        calls: Calls,
-        queries: Queries,
-        traces: Traces,
-        round_trip: RoundTrip,
-    ) -> None:
-        self.session = session
-        self.publisher = publisher
-        self.mesh = mesh
-        self.calls = calls
-        self.queries = queries
-        self.traces = traces
-        self.round_trip = round_trip
-
-    @classmethod
-    async def open(cls, broker: Broker, trunks: Endpoints, lost: Callable[[], None]) -> "_Bus":
-        """Raises BusError."""
-        zenoh = broker.configuration.zenoh
-        name = broker.configuration.broker.name
-        keys = Keys(zenoh.prefix)
-        mesh = broker.configuration.mesh
-        session = await Session.open(
-            [*zenoh.listen, *trunks.listen],
-            connect=[*mesh.connect, *trunks.connect],
-            mode=mesh.mode,
-            discover=mesh.discover,
-            lost=lambda _: lost(),
-        )
-        try:
-            return cls(
-                session,
-                await Publisher.open(session, keys, name, _describer(broker.configuration), broker.names()),
-                await ZenohMesh.open(session, keys, name, broker.mesh),
-                await Calls.open(session, keys, broker.call, broker.send, relayed=mesh.mode == "router"),
-                await Queries.open(session, keys, name, broker),
-                await Traces.open(session, keys, name, broker.trace, broker.tracing.probed),
-                await RoundTrip.open(session, keys, name),
-            )
-        except BaseException as error:
-            broker.mesh.detach(time.monotonic())
-            await session.close()
-            if session.panicked(error):
-                raise BusError(f"zenoh: {plain(error)}") from error
-            raise
-
-    async def close(self) -> None:
-        """Answer the calls under way and close the session, also when cancelled meanwhile."""
-        try:
-            await self.calls.close()
-            await self.traces.close()
-            await self.mesh.close()
-        finally:
-            await self.session.close()
-
-
-def _describer(configuration: Configuration) -> Callable[[Frame], Mapping[str, Any]]:
-    """How to say a frame in words, with the names that the configuration gives to nodes."""
-    named: dict[Address, dict[int, tuple[str, Node]]] = {
-        robot.address: {node.node: (name, node) for name, node in robot.nodes.items()}
-        for robot in configuration.robots.values()
-        if robot.address is not None
-    }
-    nothing: dict[int, tuple[str, Node]] = {}
-    return lambda frame: describe(frame, lambda address: named.get(address, nothing))
-
-
-def _trunk_table(trunk: TrunkConfiguration | LinkConfiguration) -> dict[str, Any]:
-    secret = {name for name, field in type(trunk.adapter).model_fields.items() if not field.repr}
-    return {"adapter": trunk.adapter_name, **trunk.adapter.model_dump(mode="json", exclude=secret)}
-
-
-def _link_table(link: LinkConfiguration) -> dict[str, Any]:
-    return {
-        **_trunk_table(link),
-        "protocol": link.protocol,
-        **link.codec.model_dump(mode="json"),
-        **link.options.model_dump(mode="json"),
-    }

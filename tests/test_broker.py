@@ -11,6 +11,7 @@ import pytest
 import zenoh
 
 from psiu_broker import broker as broker_module
+from psiu_broker import pulse
 from psiu_broker.broker import Broker
 from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session
@@ -394,12 +395,12 @@ async def test_the_status_counts_what_the_bus_did(lab: Lab) -> None:
 
 
 async def test_a_call_that_came_while_the_broker_stood_still_moves_nothing(lab: Lab) -> None:
-    time.sleep(broker_module.STOOD_STILL_S + 0.1)  # noqa: ASYNC251 - the loop stands still, as under SIGSTOP
+    time.sleep(pulse.STOOD_STILL_S + 0.1)  # noqa: ASYNC251 - the loop stands still, as under SIGSTOP
     for _ in range(2):  # before the clock's next tick, and after it
         with pytest.raises(CallError) as raised:
             await lab.call("MNERIM", "parafrente", 1)
         assert raised.value.code == "expired"
         await lab.broker.call(Address.named("MNERIM"), "pare", CallRequest(timeout_s=5.0))  # a stop is never late
         await asyncio.sleep(0)
-    await asyncio.sleep(broker_module.STALE_S + 2 * broker_module.TICK_S)
+    await asyncio.sleep(pulse.STALE_S + 2 * broker_module.TICK_S)
     assert (await lab.call("MNERIM", "parafrente", 1)).status == "sucesso"
