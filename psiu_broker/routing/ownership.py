@@ -67,6 +67,8 @@ class _Rival:
     """When the other heard that frame."""
     shared_at: float = -inf
     """When we last heard the same frame as it."""
+    told: tuple[object, float] | None = None
+    """The last frame that it told us of and we did not hear, and when it heard that."""
     misses: int = 0
     """How many of its frames since then we did not hear."""
     strange_at: float | None = None
@@ -187,6 +189,9 @@ class Ownership:
         rival = self._rivals.setdefault((route.robot, broker), _Rival())
         if self._heard_here(key, heard_at - SETTLED_S):
             return self._shared(route.robot, rival, better_by, now)
+        told, rival.told = rival.told, (key, heard_at)
+        if told is not None and told[0] == key and abs(heard_at - told[1]) < NOTICE_EVERY_S / 2:
+            return False  # a reminder of what it told us already
         rival.misses += 1
         if rival.asked_at is None:
             rival.asked_at, rival.key, rival.heard_at = now, key, heard_at

@@ -49,8 +49,11 @@ class World:
     def takes(self, now: float) -> bool:
         return self.ownership.takes(self.theirs, FRAME, RADIO, now)
 
-    def noticed(self, key: object, now: float, better_by: int = 0, broker: str = "B") -> bool:
-        return self.ownership.noticed(self.ours, broker, key, better_by, now, now)
+    def noticed(
+        self, key: object, now: float, better_by: int = 0, broker: str = "B", heard_at: float | None = None
+    ) -> bool:
+        heard_at = now if heard_at is None else heard_at
+        return self.ownership.noticed(self.ours, broker, key, better_by, heard_at, now)
 
     def due(self, now: float) -> list[str]:
         return [broker for _, broker in self.ownership.due(lambda _: self.ours, now)]
@@ -179,6 +182,31 @@ def test_while_both_hear_one_radio_several_frames_must_be_missed(world: World) -
         assert world.due(11.0 + number / 2 + AFTER_S) == []
     world.noticed("missed too", 13.0)
     assert world.due(13.0 + AFTER_S) == ["B"]
+
+
+def test_a_missed_frame_counts_once_however_often_it_is_told(world: World) -> None:
+    world.heard["common"] = 10.0
+    world.noticed("common", 10.0)
+    for number in range(MISSES):
+        world.noticed("missed", 11.0 + number * REMIND_S, heard_at=11.0 + number / 100)
+        assert world.due(11.0 + number * REMIND_S + AFTER_S) == []
+
+
+def test_the_same_words_missed_several_times_count_each_time(world: World) -> None:
+    world.heard["common"] = 10.0
+    world.noticed("common", 10.0)
+    for number in range(MISSES):
+        world.noticed("vivo", 11.0 + number * NOTICE_EVERY_S)
+    assert world.due(11.0 + MISSES * NOTICE_EVERY_S) == ["B"]
+
+
+def test_a_reminder_of_where_the_robot_was_is_no_alternation(world: World) -> None:
+    for second in range(1, 3):
+        world.ours.heard_at = second - 0.5
+        world.noticed(second, float(second))
+        world.ours.heard_at = second + 0.2
+        world.noticed(second, second + REMIND_S, heard_at=float(second))
+    assert world.ownership.conflicts == {}
 
 
 def test_when_both_heard_it_long_ago_one_frame_is_enough(world: World) -> None:
