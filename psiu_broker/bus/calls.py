@@ -20,6 +20,7 @@ from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.once import Once
 from psiu_broker.bus.replies import Replies
 from psiu_broker.bus.session import Session, json_of
+from psiu_broker.bus.work import Work
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Answer, CallRequest
@@ -68,8 +69,7 @@ class Calls:
         self._stop_room = threading.BoundedSemaphore(AT_ONCE_MAX)
         self._gets = Once(relayed=relayed)
         self._puts = Once(relayed=relayed)
-        self._closed = False
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._work = Work(self._replies)
 
     @classmethod
     async def open(cls, session: Session, keys: Keys, call: Call, send: Send, *, relayed: bool = False) -> "Calls":
@@ -97,13 +97,7 @@ class Calls:
 
     async def close(self) -> None:
         """Answer every call under way, and each that comes later, with ``shutting_down``; before `Session.close`."""
-        self._closed = True
-        await asyncio.sleep(0)  # a task that is cancelled before its first step says nothing
-        for task in tuple(self._tasks):
-            task.cancel()
-        if self._tasks:
-            await asyncio.wait(self._tasks)
-        await self._replies.sent()
+        await self._work.close()
 
     def _sift_query(self, query: zenoh.Query) -> _Accepted | None:
         """What of `query` the loop must see."""
@@ -145,13 +139,10 @@ class Calls:
         return _Accepted(key, robot, command, request, query, room)
 
     def _begin(self, accepted: _Accepted) -> None:
-        if self._closed:  # `close` may have told its tasks to end already; one that never began says nothing
+        if self._work.closed:  # `close` may have told its tasks to end already; one that never began says nothing
             self._turn_away(accepted)
             return
-        work = self._serve_put(accepted) if accepted.query is None else self._serve(accepted, accepted.query)
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._work.begin(self._serve_put(accepted) if accepted.query is None else self._serve(accepted, accepted.query))
 
     def _turn_away(self, accepted: _Accepted) -> None:
         stopping = CallError("shutting_down", "the broker is stopping")
@@ -167,7 +158,7 @@ class Calls:
 
     async def _outcome(self, accepted: _Accepted, query: zenoh.Query) -> "Future[None]":
         """The reply to `query`, on its way."""
-        if self._closed:
+        if self._work.closed:
             return self._replies.refuse(query, CallError("shutting_down", "the broker is stopping"))
         try:
             answer = await self._call(accepted.robot, accepted.command, accepted.request)

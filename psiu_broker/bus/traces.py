@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from psiu_broker.bus.keys import Keys, chunk, robot, robot_chunk
 from psiu_broker.bus.replies import Replies
 from psiu_broker.bus.session import Session, aside, json_of, plain
+from psiu_broker.bus.work import Work
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
 from psiu_broker.mesh.probe import Probed, Stamp
@@ -49,8 +50,7 @@ class Traces:
         self._probes = f"{keys.prefix}/@mesh/probe"
         self._replies = Replies(session, "bus-trace")
         self._room = threading.BoundedSemaphore(AT_ONCE_MAX)
-        self._closed = False
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._work = Work(self._replies)
 
     @classmethod
     async def open(cls, session: Session, keys: Keys, broker: str, make: Make, look: Look) -> "Traces":
@@ -75,13 +75,7 @@ class Traces:
 
     async def close(self) -> None:
         """End what is under way; before `Session.close`."""
-        self._closed = True
-        await asyncio.sleep(0)  # a task that is cancelled before its first step says nothing
-        for task in tuple(self._tasks):
-            task.cancel()
-        if self._tasks:
-            await asyncio.wait(self._tasks)
-        await self._replies.sent()
+        await self._work.close()
 
     async def probe(self, owner: str, which: Address, timeout_s: float) -> tuple[Probed, Sequence[Stamp]]:
         """Have broker `owner` ask its robot, and Zenoh note where question and answer pass.
@@ -120,7 +114,7 @@ class Traces:
             # A question names its robots; what wildcards cover is asked nothing.
             named = not any("*" in part for part in asked.split("/")[-2:])
             try:
-                value = await work(asked) if named and not self._closed else None
+                value = await work(asked) if named and not self._work.closed else None
                 reply = self._replies.answer(query, {} if value is None else {own(asked): (encoding, value)})
             except (CallError, ValueError) as error:
                 reply = self._replies.refuse(query, CallError("bad_request", str(error)))
@@ -131,13 +125,11 @@ class Traces:
                 reply = self._replies.refuse(query, CallError("impossible", "the broker failed; its log says how"))
             reply.add_done_callback(lambda _: self._room.release())
 
-        def begin(query: zenoh.Query) -> None:
-            task = asyncio.get_running_loop().create_task(answer(query))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
         await self._session.serve(
-            lambda: self._session.zenoh.declare_queryable(key, ring), self._sift, begin, name="bus-traces"
+            lambda: self._session.zenoh.declare_queryable(key, ring),
+            self._sift,
+            lambda query: self._work.begin(answer(query)),
+            name="bus-traces",
         )
 
     def _sift(self, query: zenoh.Query) -> zenoh.Query | None:
