@@ -62,8 +62,8 @@ class ZenohMesh:
         self._root = f"{keys.prefix}/@mesh"
         self._presence = ""
         self._edition = 0
-        self._tokens: dict[str, Declared] = {}
-        """By key without its edition; touched by the worker only."""
+        self._tokens: dict[str, Declared | None] = {}
+        """By key without its edition, None where Zenoh would not declare it; touched by the worker only."""
         self._worker: Executor = session.worker("mesh")
         self._twice: set[str] = set()
         """Whom two links lead to, as was told once: Zenoh may keep half of one (its issue 2806)."""
@@ -184,7 +184,7 @@ class ZenohMesh:
                 logger.warning("announcing: %s", plain(error))
 
     def _declare(self, key: str) -> None:
-        if key not in self._tokens:
+        if self._tokens.setdefault(key, None) is None:
             self._tokens[key] = self._session.zenoh.liveliness().declare_token(f"{key}/{self._edition}")
 
     def _undeclare(self, key: str) -> None:
@@ -193,13 +193,17 @@ class ZenohMesh:
             token.undeclare()
 
     def _declare_tokens_anew(self) -> None:
+        """One that cannot be declared now stays as it is until the next time."""
         self._edition += 1
-        old = self._tokens
-        self._tokens = {}
-        for key in old:
-            self._declare(key)
-        for token in old.values():
-            token.undeclare()
+        former = dict(self._tokens)
+        for key, token in former.items():
+            self._tokens[key] = None
+            self._guarded(self._declare, key)
+            if self._tokens[key] is None:
+                self._tokens[key], former[key] = token, None
+        for token in former.values():
+            if token is not None:
+                self._guarded(token.undeclare)
 
     def _end_links(self, zenoh_id: str | None) -> None:
         links = [

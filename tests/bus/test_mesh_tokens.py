@@ -77,6 +77,53 @@ def test_no_key_raises_anything_but_what_the_reader_expects(chunks: list[str]) -
         read(made, f"psiu/@mesh/{word}/" + "/".join(chunks))
 
 
+class Tokens:
+    """In the place of a session whose liveliness refuses the keys with `refused` in them."""
+
+    def __init__(self) -> None:
+        self.refused = "nothing"
+        self.stand: list[str] = []
+        self.zenoh_id = "a"
+        self.zenoh = SimpleNamespace(liveliness=lambda: self)
+
+    def worker(self, name: str) -> None: ...
+
+    def panicked(self, error: BaseException) -> bool:
+        return False
+
+    def declare_token(self, key: str) -> Any:
+        if self.refused in key:
+            raise zenoh.ZError("not now")
+        self.stand.append(key)
+        return SimpleNamespace(undeclare=lambda: self.stand.remove(key))
+
+
+def test_a_token_that_cannot_be_declared_anew_stays_and_costs_no_other_its_own() -> None:
+    session, nobody = Tokens(), SimpleNamespace()
+    made = ZenohMesh(session, Keys(), "own", nobody)  # type: ignore[arg-type]
+    for key in "abc":
+        made._declare(key)
+    session.refused = "b/"
+    made._declare_tokens_anew()
+    assert sorted(session.stand) == ["a/1", "b/0", "c/1"]
+    session.refused = "nothing"
+    made._declare_tokens_anew()
+    assert sorted(session.stand) == ["a/2", "b/2", "c/2"]
+    made._undeclare("b")
+    assert sorted(session.stand) == ["a/2", "c/2"]
+
+
+def test_a_token_that_could_not_be_declared_is_when_all_are_declared_anew() -> None:
+    session, nobody = Tokens(), SimpleNamespace()
+    made = ZenohMesh(session, Keys(), "own", nobody)  # type: ignore[arg-type]
+    session.refused = "b/"
+    for key in "abc":
+        made._guarded(made._declare, key)
+    session.refused = "nothing"
+    made._declare_tokens_anew()
+    assert sorted(session.stand) == ["a/1", "b/1", "c/1"]
+
+
 def test_terms_come_to_an_end_rather_than_break() -> None:
     claims = Claims()
     robot = Address.named("MNERIM")
