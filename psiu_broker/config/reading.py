@@ -110,11 +110,9 @@ def _link(
 ) -> LinkConfiguration | None:
     key: Key = ("links", name)
     before = len(problems.lines)
-    table = problems.table(value, key)
+    table = _named_table("link", name, value, key, problems)
     if table is None:
         return None
-    if not LINK_NAME.fullmatch(name):
-        problems.add(key, "expected a name of letters, digits, - and _; rename the link")
     adapter_name, adapter_model = _adapter(table, key, problems)
     protocol = _choice(table, key, "protocol", CODECS, problems)
     codec_model = CODECS[protocol].Options if protocol else None
@@ -142,11 +140,9 @@ def _link(
 def _trunk(name: str, value: object, problems: Problems) -> TrunkConfiguration | None:
     key: Key = ("trunks", name)
     before = len(problems.lines)
-    table = problems.table(value, key)
+    table = _named_table("trunk", name, value, key, problems)
     if table is None:
         return None
-    if not LINK_NAME.fullmatch(name):
-        problems.add(key, "expected a name of letters, digits, - and _; rename the trunk")
     adapter_name, adapter_model = _adapter(table, key, problems)
     if adapter_model is None or adapter_name is None:
         return None
@@ -157,6 +153,14 @@ def _trunk(name: str, value: object, problems: Problems) -> TrunkConfiguration |
     trunk = TrunkConfiguration(name, adapter_name, adapter)
     check_trunk(trunk, key, problems)
     return trunk if len(problems.lines) == before else None
+
+
+def _named_table(kind: str, name: str, value: object, key: Key, problems: Problems) -> dict[str, Any] | None:
+    """`value` if it is a table; what is wrong with its name is noted too."""
+    table = problems.table(value, key)
+    if table is not None and not LINK_NAME.fullmatch(name):
+        problems.add(key, f"expected a name of letters, digits, - and _; rename the {kind}")
+    return table
 
 
 def _adapter(table: dict[str, Any], key: Key, problems: Problems) -> tuple[str | None, type[Adapter] | None]:
