@@ -117,6 +117,7 @@ class Neighbour:
             round_trip_s = now - (ours_us + held_us) / 1e6
             if 0 <= round_trip_s < SILENT_S:
                 self._round_trips.append(round_trip_s)
+                self._correct_offsets(now - beat.sent_us / 1e6 - round_trip_s)
 
     def echo(self, now: float) -> tuple[int, int] | None:
         """What our own beat says of this broker's."""
@@ -138,6 +139,14 @@ class Neighbour:
         new = self._series(lane).take(number)
         self.doubles += not new
         return new
+
+    def _correct_offsets(self, least: float) -> None:
+        """Its clock reads at least so much less than ours, as no beat takes longer than a whole round trip.
+
+        Offsets below that are of a time before its clock stood still, in a sleep too short for anybody to miss it.
+        """
+        if min(self._offsets) < least:
+            self._offsets = deque((each for each in self._offsets if each >= least), OFFSETS)
 
     def _series(self, lane: int) -> Sequence:
         series = self.received.get(lane)

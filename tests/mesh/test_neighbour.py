@@ -54,6 +54,22 @@ def test_a_clock_that_stood_still_while_its_broker_slept_counts_anew(neighbour: 
     assert late_s(neighbour, 104.1, 3700.602) == pytest.approx(0, abs=1e-4)
 
 
+def test_a_clock_that_stood_still_for_less_than_the_lease_counts_anew_with_the_next_echo(neighbour: Neighbour) -> None:
+    """B's clock reads 104.0 at 105.5 of ours; its answer to our beat took 4 ms there and back."""
+    neighbour.beat(beat(FAR_S + 104, {"A": (105_400_000, 98_000)}), "A", 0, 105.502)
+    assert late_s(neighbour, 104.1, 105.602) == pytest.approx(0, abs=0.005)
+    assert late_s(neighbour, 104.1, 107.602) == pytest.approx(2, abs=0.005)
+
+
+def test_a_network_that_has_become_slow_does_not_make_a_frame_seem_quick(neighbour: Neighbour) -> None:
+    """Both ways take 0.4 s now."""
+    for number in range(30):
+        sent = 104 + number * BEAT_S
+        ours_us = int((sent - 0.5) * 1e6)
+        neighbour.beat(beat(FAR_S + sent, {"A": (ours_us, 100_000)}), "A", 0, sent + 0.4)
+        assert late_s(neighbour, sent, sent + 0.4) == pytest.approx(0.398, abs=1e-4)
+
+
 def test_the_round_trip_is_measured_by_our_own_clock(neighbour: Neighbour) -> None:
     """Our beat left at 104.0; B held its answer back for 0.3 s; the whole took 0.31 s."""
     assert neighbour.round_trip_s is None
