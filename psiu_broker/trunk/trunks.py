@@ -1,22 +1,14 @@
-"""All trunks of a broker, and the folder in which they meet its Zenoh session."""
+"""All trunks of a broker, and where they meet its Zenoh session."""
 
-import logging
-import os
-import shutil
-import tempfile
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from psiu_broker.config import TrunkConfiguration
+from psiu_broker.trunk.folder import Folder
 from psiu_broker.trunk.local import Meeting
 from psiu_broker.trunk.trunk import Trunk
-
-FOLDER_MAX: Final = 60
-"""A Unix socket's path has no more than 107 bytes."""
-
-log = logging.getLogger(__name__)
 
 
 class Endpoints(NamedTuple):
@@ -31,7 +23,7 @@ class Trunks:
 
     def __init__(self, broker: str, configurations: Collection[TrunkConfiguration]) -> None:
         epoch = f"{time.time_ns():x}"
-        self._folder: Path | None = None
+        self._folder: Folder | None = None
         self._all = [Trunk(each, broker, epoch, Meeting(Path(), Path())) for each in configurations]
 
     def __iter__(self) -> Iterator[Trunk]:
@@ -42,38 +34,23 @@ class Trunks:
         if not self._all:
             return Endpoints()
         # A new one each time: a session lost to a panic may still be in the old one.
-        former, self._folder = self._folder, _new_folder()
-        _remove(former)
+        former, self._folder = self._folder, Folder.make()
+        if former is not None:
+            former.remove()
         if self._folder is None:
             return Endpoints()
-        session = self._folder / "session"
-        doors = [self._folder / str(number) for number in range(len(self._all))]
+        session = self._folder.path / "session"
+        doors = [self._folder.path / str(number) for number in range(len(self._all))]
         for trunk, door in zip(self._all, doors, strict=True):
             trunk.move(Meeting(door, session))
         return Endpoints([_endpoint(session)], [_endpoint(door) for door in doors])
 
     def close(self) -> None:
         """Leave nothing behind, when the trunks have ended and the session is closed."""
-        _remove(self._folder)
+        if self._folder is not None:
+            self._folder.remove()
         self._folder = None
-
-
-def _new_folder() -> Path | None:
-    """One that only this user may enter; None where none can be made, which stops nothing but the trunks."""
-    folder = tempfile.gettempdir()
-    if len(os.fsencode(folder)) > FOLDER_MAX:
-        folder = "/tmp"  # noqa: S108 - mkdtemp
-    try:
-        return Path(tempfile.mkdtemp(prefix="psiu-trunks-", dir=folder))
-    except OSError as error:
-        log.warning("the trunks cannot meet Zenoh: %s", error)
-        return None
 
 
 def _endpoint(path: Path) -> str:
     return f"unixsock-stream/{path}"
-
-
-def _remove(folder: Path | None) -> None:
-    if folder is not None:
-        shutil.rmtree(folder, ignore_errors=True)
