@@ -304,7 +304,7 @@ class Calling:
                 shown = await self.ask(route, SHOW, [index])
                 command = listed(shown.values)
                 if command is not None:
-                    profile.learn(command)
+                    profile.learn_command(command)
         except CallError as error:
             log.info("asking %s for its commands: %s", route.robot, error)
 

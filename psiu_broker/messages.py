@@ -17,6 +17,10 @@ def _rfc3339(moment: datetime) -> str:
 
 Moment = Annotated[datetime, PlainSerializer(_rfc3339, return_type=str, when_used="json")]
 Value = int | float | str
+Kind = Literal[
+    "command", "response", "ping", "ack", "nak", "busy", "available", "free", "wtf", "node", "complex", "event", "error"
+]
+"""What a frame is; event: something told unasked, as a sensor's value."""
 
 
 class Message(BaseModel):
@@ -31,7 +35,7 @@ class Decoded(Message):
     source: str
     destination: str
     protocol: str
-    kind: Literal["command", "response", "ping", "ack", "nak", "busy", "available", "free", "wtf", "node", "complex"]
+    kind: Kind
     command: str | None = Field(default=None, description="the command word or the node's name")
     parameters: list[Value] = []
     status: Literal["sucesso", "falha"] | None = None
@@ -40,7 +44,10 @@ class Decoded(Message):
     value: float | None = Field(default=None, description="the signal in the unit of the node's declared type")
     unit: str | None = None
     fields: list[str] | None = Field(default=None, description="PSIU HEXA complex: the fields in hexadecimal")
-    remark: str | None = Field(default=None, description="what a tolerant codec forgave, such as a wrong size")
+    readings: dict[str, Value] = Field(default={}, description="several values told at once, by name: pins, sensors")
+    remark: str | None = Field(
+        default=None, description="what a tolerant codec forgave, such as a wrong size, or what it means in words"
+    )
     broker: str
     link: str
     received: Moment
@@ -57,6 +64,8 @@ class Command(Message):
     minimum: int | None = None
     maximum: int | None = None
     unit: str | None = None
+    description: str | None = Field(default=None, description="what it does, and what its parameters mean")
+    aliases: list[str] = Field(default=[], description="other names for it: D for drive")
 
 
 class Card(Message):
@@ -91,6 +100,9 @@ class Answer(Message):
     status: Literal["sucesso", "falha"] | None = None
     values: list[Value] = []
     unit: str | None = None
+    remark: str | None = Field(
+        default=None, description="for a person: an error in words, or that robots do not answer"
+    )
     elapsed_ms: float
 
 

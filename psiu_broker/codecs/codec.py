@@ -36,10 +36,14 @@ class Codec(ABC):
     """True while bytes wait for more."""
     silence_s: float
     """A silence this long ends whatever was begun: the link then calls `flush`."""
+    addressed: bool = True
+    """False: its packets name nobody, or only a number within the packet; the link knows who is at its ends."""
+    remembers: ClassVar[bool] = False
+    """True: what a datagram means depends on those before it, so that each far end needs a codec of its own."""
 
     @abstractmethod
-    def __init__(self, options: Any, directory: Directory) -> None:
-        """`options` is an instance of this class's `Options`."""
+    def __init__(self, options: Any, directory: Directory, *, datagrams: bool = False) -> None:
+        """`options` is an instance of this class's `Options`; `datagrams`: each frame travels in one of its own."""
 
     def whole(self, data: bytes) -> Frame | None:
         """The frame, if `data` is exactly one, of a kind that this codec can tell at a glance; None: `decode` it.
@@ -63,3 +67,7 @@ class Codec(ABC):
         Raises:
             EncodeError: this protocol or dialect cannot say it.
         """
+
+    def pieces(self, wire: bytes) -> Sequence[bytes]:
+        """The datagrams that the bytes of one frame leave in, where they leave in datagrams."""
+        return (wire,)

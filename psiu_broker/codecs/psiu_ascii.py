@@ -100,7 +100,7 @@ class PsiuAscii(Codec):
         )
         silence_ms: int = Field(200, ge=20, description="half a frame is given up after such a silence")
 
-    def __init__(self, options: Options, directory: Directory) -> None:
+    def __init__(self, options: Options, directory: Directory, *, datagrams: bool = False) -> None:
         self.options = options
         self.dialect = _CANONICAL if options.line_end == "none" else _CRLF
         self.silence_s = self._silence_s = options.silence_ms / 1000

@@ -92,7 +92,7 @@ class PsiuHexa(Codec):
         local: int = Field(0, ge=0, le=255, description="our own address, also where packets carry none")
         remote: int | None = Field(None, ge=0, le=255, description="the robot at the far end of a point-to-point link")
 
-    def __init__(self, options: Options, directory: Directory) -> None:
+    def __init__(self, options: Options, directory: Directory, *, datagrams: bool = False) -> None:
         self.options = options
         self.silence_s = options.silence_ms / 1000
         self.dialect = "/".join(filter(None, (PROTOCOL, options.topology, options.size, options.crc, options.domain)))

@@ -1,38 +1,22 @@
 """A frame in the words of `messages.Decoded`."""
 
 from collections.abc import Callable, Mapping
-from typing import Final, Literal, TypedDict
+from typing import Final
 
 from psiu_broker.codecs import psiu_hexa
 from psiu_broker.frame import Address, Frame
-from psiu_broker.messages import Value
+from psiu_broker.messages import Kind
 from psiu_broker.profiles.hexa import ACK, AVAILABLE, BUSY, FREE, NAK, WTF
 from psiu_broker.profiles.node import Node
-from psiu_broker.profiles.profile import Status
+from psiu_broker.profiles.profile import Description
 from psiu_broker.profiles.psiu import said
 
-Kind = Literal["command", "response", "ping", "ack", "nak", "busy", "available", "free", "wtf", "node", "complex"]
 NodesOf = Callable[[Address], Mapping[int, tuple[str, Node]]]
 """The named nodes of a robot by number; empty where nobody named any."""
 
 _KINDS: Final[Mapping[int, Kind]] = {
     ACK: "ack", NAK: "nak", BUSY: "busy", AVAILABLE: "available", FREE: "free", WTF: "wtf",
 }  # fmt: skip
-
-
-class Description(TypedDict):
-    """The fields of `Decoded` that a frame alone tells."""
-
-    kind: Kind
-    command: str | None
-    parameters: list[Value]
-    status: Status | None
-    node: int | None
-    signal: int | None
-    value: float | None
-    unit: str | None
-    fields: list[str] | None
-    remark: str | None
 
 
 def describe(frame: Frame, nodes: NodesOf) -> Description:

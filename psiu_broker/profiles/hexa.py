@@ -2,14 +2,16 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal, Self
+
+from pydantic import Field
 
 from psiu_broker.codecs import psiu_hexa
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Value
 from psiu_broker.profiles.node import Node
-from psiu_broker.profiles.profile import Notice, Profile, Reading, Reply, Request
+from psiu_broker.profiles.profile import Notice, Profile, Reading, Reply, Request, RobotOptions
 from psiu_broker.profiles.psiu import COUNT, NAME, SHOW, SHOW_PRINTED, typed
 
 __all__ = ["ACK", "AVAILABLE", "BUSY", "FREE", "NAK", "RESERVED", "WTF", "HexaProfile", "Node"]
@@ -22,11 +24,21 @@ FREE: Final = 70
 WTF: Final = 87
 RESERVED: Final = frozenset({"ping", "node", "complex", NAME, COUNT, SHOW, SHOW_PRINTED})
 """What no node can be called: commands that every robot has, and those that the broker answers for it."""
+SensorReply = Literal["node-0", "bit7"]
 _NOTICES: Final = {NAK: Notice.AGAIN, BUSY: Notice.BUSY, FREE: Notice.FREE, WTF: Notice.IMPOSSIBLE}
 _ANSWER_BIT: Final = 0x80
 _SHORTEST_COMPLEX: Final = 3
 _PING: Final = Command(name="ping")
 _RAW: Final = (Command(name="node", ints=2), Command(name="complex", chars=1))
+
+
+class HexaOptions(RobotOptions):
+    """What ``[robots.NAME]`` may hold for a PSIU HEXA robot, beside its address."""
+
+    nodes: dict[str, Node] = Field({}, description="names for its nodes")
+    sensor_reply: SensorReply = Field(
+        "node-0", description="how its sensors answer, as node 0, or as themselves with bit 7 set"
+    )
 
 
 class HexaProfile(Profile):
@@ -36,18 +48,23 @@ class HexaProfile(Profile):
     """
 
     protocol = "psiu-hexa"
+    Options = HexaOptions
 
     def __init__(
         self,
         nodes: Mapping[str, Node],
         timeout_s: float = 2.0,
-        sensor_reply: Literal["node-0", "bit7"] = "node-0",
+        sensor_reply: SensorReply = "node-0",
     ) -> None:
         self._nodes = dict(nodes)
         self._by_number = {node.node: node for node in nodes.values()}
         self._timeout_s = timeout_s
         self._sensor_reply = sensor_reply
         self.poll = Request("available", bytes((AVAILABLE,)), True, timeout_s)
+
+    @classmethod
+    def make(cls, codec: Any, robot: HexaOptions, timeout_s: float, *, datagrams: bool = False) -> Self:
+        return cls(robot.nodes, timeout_s, robot.sensor_reply)
 
     def commands(self) -> Sequence[Command]:
         return (_PING, *(_command(name, node) for name, node in self._nodes.items()), *_RAW)

@@ -3,33 +3,42 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from enum import Enum
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Final, Literal, NamedTuple, Self, TypedDict
+
+from pydantic import BaseModel, ConfigDict
 
 from psiu_broker.frame import Frame
-from psiu_broker.messages import Command, Value
+from psiu_broker.messages import Command, Kind, Value
 
 Status = Literal["sucesso", "falha"]
+
+
+class Reply(NamedTuple):
+    """A robot's answer: how it went, or what it told, or both; `remark` is for a person."""
+
+    status: Status | None
+    values: tuple[Value, ...] = ()
+    unit: str | None = None
+    remark: str | None = None
+
+
+SENT: Final = Reply(None, remark="sent; this robot does not answer")
+"""What silence means where the protocol has no answers."""
 
 
 class Request(NamedTuple):
     """One call in a protocol's words; with two addresses around them, `subject` and `payload` are a frame.
 
     `question` is true where asking again does no harm: anything else may have moved the robot,
-    and is never repeated on silence alone. `timeout_s` is how long one try waits.
+    and is never repeated on silence alone. `timeout_s` is how long one try waits. `silence` is what it
+    means that nothing comes in that time; None: that there is no answer.
     """
 
     subject: str
     payload: bytes
     question: bool
     timeout_s: float
-
-
-class Reply(NamedTuple):
-    """A robot's answer: how it went, or what it told, or both."""
-
-    status: Status | None
-    values: tuple[Value, ...] = ()
-    unit: str | None = None
+    silence: Reply | None = None
 
 
 class Notice(Enum):
@@ -44,12 +53,44 @@ class Notice(Enum):
 Reading = Reply | Notice
 
 
+class Description(TypedDict, total=False):
+    """The fields of `messages.Decoded` that a frame alone tells."""
+
+    kind: Kind
+    command: str | None
+    parameters: list[Value]
+    status: Status | None
+    node: int | None
+    signal: int | None
+    value: float | None
+    unit: str | None
+    fields: list[str] | None
+    readings: dict[str, Value]
+    remark: str | None
+
+
+class RobotOptions(BaseModel):
+    """What ``[robots.NAME]`` may hold for one protocol, beside link, address and peer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
 class Profile(ABC):
     """One robot as callers see it."""
 
     protocol: ClassVar[str]
+    Options: ClassVar[type[RobotOptions]] = RobotOptions
+    """What the user may write for such a robot in ``[robots.NAME]``."""
     poll: Request | None = None
     """What asks a robot that said BUSY whether it is free; None where the protocol has no such question."""
+
+    @classmethod
+    @abstractmethod
+    def make(cls, codec: Any, robot: Any, timeout_s: float, *, datagrams: bool = False) -> Self:
+        """The robot that `robot`, this class's `Options`, tells of, on a link whose codec has the options `codec`.
+
+        `timeout_s` is how long it may take to answer; `datagrams` whether its link carries datagrams.
+        """
 
     @abstractmethod
     def commands(self) -> Sequence[Command]:
@@ -73,3 +114,18 @@ class Profile(ABC):
 
         PSIU numbers no message, so that a late answer to one such request reads as the answer to the next.
         """
+
+    def greeting(self) -> Sequence[Request]:
+        """What to tell or ask the robot when its link has opened, in this order."""
+        return ()
+
+    def learn(self, frame: Frame) -> bool:
+        """Take note of what the robot says, answer or not; never raises.
+
+        True when it has begun anew and wants its `greeting` again.
+        """
+        return False
+
+    def describe(self, frame: Frame) -> Description:
+        """What a frame from or to the robot says; never raises."""
+        return {"kind": "command", "command": frame.subject}

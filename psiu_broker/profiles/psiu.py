@@ -4,12 +4,15 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Final, NamedTuple
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple, Self
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from psiu_broker.errors import CallError
 from psiu_broker.frame import EVERYONE, Frame
 from psiu_broker.messages import Command, Value
-from psiu_broker.profiles.profile import Profile, Reading, Reply, Request, Status
+from psiu_broker.profiles.profile import Profile, Reading, Reply, Request, RobotOptions, Status
 
 NAME: Final = "qualseunome"
 COUNT: Final = "quantoscomandos"
@@ -116,19 +119,55 @@ def listed(values: Sequence[Value]) -> Command | None:
             return None
 
 
+class DeclaredCommand(BaseModel):
+    """A command that the configuration knows of: exibecomando tells neither ranges nor units."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    ints: int = Field(0, ge=0, le=_PARAMETERS_KEPT, description="how many whole numbers it takes")
+    floats: int = Field(0, ge=0, le=_PARAMETERS_KEPT, description="how many numbers with a point it takes")
+    chars: int = Field(0, ge=0, le=_PARAMETERS_KEPT, description="how many words it takes")
+    minimum: int | None = Field(None, description="the least that a number may be")
+    maximum: int | None = Field(None, description="the most that a number may be")
+    unit: str | None = Field(None, description="the unit of its numbers")
+    description: str | None = Field(None, description="what it does")
+
+
+class PsiuOptions(RobotOptions):
+    """What ``[robots.NAME]`` may hold for a PSIU ASCII robot."""
+
+    commands: dict[str, DeclaredCommand] = Field({}, description="what it can be told, with ranges and units")
+
+
 class PsiuProfile(Profile):
-    """A PSIU ASCII robot. Words that neither the document nor the robot has told of are sent as they are."""
+    """A PSIU ASCII robot. Words that neither the document, the configuration nor the robot has told of are sent on.
+
+    What the configuration says of a command goes before what the robot says of it.
+    """
 
     protocol = "psiu-ascii"
+    Options = PsiuOptions
 
-    def __init__(self, timeout_s: float = 2.0, per_unit_s: float = 0.012) -> None:
+    def __init__(
+        self,
+        timeout_s: float = 2.0,
+        per_unit_s: float = 0.012,
+        declared: Mapping[str, DeclaredCommand] = MappingProxyType({}),
+    ) -> None:
         self._timeout_s = timeout_s
         self._per_unit_s = per_unit_s
-        self._learned: dict[str, Command] = {}
+        self._declared = {name: Command(name=name, **each.model_dump()) for name, each in declared.items()}
+        self._learned: dict[str, Command] = dict(self._declared)
 
-    def learn(self, command: Command) -> None:
+    @classmethod
+    def make(cls, codec: Any, robot: PsiuOptions, timeout_s: float, *, datagrams: bool = False) -> Self:
+        return cls(timeout_s, declared=robot.commands)
+
+    def learn_command(self, command: Command) -> None:
         """Take what the robot itself said of one command; the document's range stays where the robot's count fits."""
-        if command.name in _QUESTIONS or (command.name not in self._learned and len(self._learned) >= LEARNED_KEPT):
+        if command.name in _QUESTIONS or command.name in self._declared:
+            return
+        if command.name not in self._learned and len(self._learned) >= LEARNED_KEPT:
             return
         motion = _MOTIONS.get(command.name)
         if motion is not None and (command.ints + command.floats, command.chars) == (1, 0):

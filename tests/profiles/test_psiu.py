@@ -107,8 +107,8 @@ def test_a_number_that_is_no_distance_does_not_make_the_caller_wait_for_days() -
 
 def test_what_the_robot_lists_is_checked_by_count_and_type() -> None:
     profile = PsiuProfile()
-    profile.learn(Command(name="mova", ints=2, floats=1))
-    profile.learn(Command(name="toque", chars=1))
+    profile.learn_command(Command(name="mova", ints=2, floats=1))
+    profile.learn_command(Command(name="toque", chars=1))
     assert refusal("mova", 1, profile=profile) == "mova takes 2 ints and 1 float, got 1"
     assert refusal("mova", 1, 2, "x", profile=profile) == "mova takes 2 ints and 1 float, got 1 2 x"
     assert refusal("mova", 1, 0.5, 2.5, profile=profile) == "mova takes 2 ints and 1 float, got 1 0.5 2.5"
@@ -121,16 +121,16 @@ def test_what_the_robot_lists_is_checked_by_count_and_type() -> None:
 
 def test_a_learned_motion_keeps_the_range_of_the_document_where_its_count_fits() -> None:
     profile = PsiuProfile()
-    profile.learn(Command(name="parafrente", floats=1))
+    profile.learn_command(Command(name="parafrente", floats=1))
     assert refusal("parafrente", 1200, profile=profile) == "parafrente takes 0–999 cm, got 1200"
     assert profile.request("parafrente", [1.25]).payload == b"parafrente 1.25"
-    profile.learn(Command(name="parafrente", ints=2))
+    profile.learn_command(Command(name="parafrente", ints=2))
     assert profile.request("parafrente", [5000, 3]).payload == b"parafrente 5000 3"
 
 
 def test_a_robot_cannot_change_the_questions_of_the_document() -> None:
     profile = PsiuProfile()
-    profile.learn(Command(name="quantoscomandos", ints=3))
+    profile.learn_command(Command(name="quantoscomandos", ints=3))
     assert profile.request("quantoscomandos", []).question
     assert [command.name for command in profile.commands()].count("quantoscomandos") == 1
 
@@ -140,7 +140,7 @@ def test_commands_are_the_documents_until_the_robot_has_listed_its_own() -> None
     names = [command.name for command in profile.commands()]
     assert names[:3] == ["qualseunome", "quantoscomandos", "exibecomando"]
     assert names[3:] == ["parafrente", "paratras", "giradireita", "giraesquerda"]
-    profile.learn(Command(name="parafrente", ints=1))
+    profile.learn_command(Command(name="parafrente", ints=1))
     listed_now = profile.commands()
     assert [command.name for command in listed_now[3:]] == ["parafrente"]
     assert listed_now[3].maximum == 999
@@ -149,7 +149,7 @@ def test_commands_are_the_documents_until_the_robot_has_listed_its_own() -> None
 def test_a_robot_that_lists_without_end_teaches_a_bounded_number_of_commands() -> None:
     profile = PsiuProfile()
     for number in range(LEARNED_KEPT * 2):
-        profile.learn(Command(name=f"c{number}"))
+        profile.learn_command(Command(name=f"c{number}"))
     assert len(profile.commands()) == LEARNED_KEPT + 3
 
 
