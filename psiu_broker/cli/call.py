@@ -7,7 +7,7 @@ import click
 
 from psiu_broker.cli.commands import WordsCommand, examples
 from psiu_broker.cli.connection import Connection, connects
-from psiu_broker.cli.output import on_terminal, print_json, printable, styled
+from psiu_broker.cli.output import on_terminal, print_json, print_models, printable, styled
 from psiu_broker.cli.tables import show_robots
 from psiu_broker.errors import CallError
 from psiu_broker.messages import Answer, CallRequest, Value
@@ -100,7 +100,7 @@ def discover(connection: Connection) -> None:
             client.call(broker.broker, DISCOVER)
         cards = client.cards()
     if connection.as_json:
-        print_json([card.model_dump(mode="json") for card in cards])
+        print_models(cards)
     else:
         show_robots(cards, drawn=on_terminal())
 
@@ -110,7 +110,7 @@ def answer_line(robot: str, answer: Answer) -> str:
     words = [answer.status, *answer.values, answer.unit if answer.values else None]
     said = " ".join(str(word) for word in words if word is not None) or "answered"
     colour = {"sucesso": "green", "falha": "red"}.get(answer.status or "")
-    return f"{printable(robot)}: {styled(printable(said), fg=colour, bold=True)} ({answer.elapsed_ms:.1f} ms)"
+    return f"{printable(robot)}: {styled(said, fg=colour, bold=True)} ({answer.elapsed_ms:.1f} ms)"
 
 
 def _request(parameters: tuple[str, ...], timeout_s: float | None = None) -> CallRequest:

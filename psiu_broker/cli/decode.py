@@ -137,7 +137,7 @@ def _malformed(malformed: Malformed, protocol: str) -> dict[str, Any]:
 def _line(event: Event, protocol: str) -> str:
     if isinstance(event, Frame):
         pair = printable(f"{event.source or '?'} → {event.destination or '?'}")
-        return f"{protocol}  {pair}  {styled(printable(frame_words(_frame(event))), bold=True)}"
+        return f"{protocol}  {pair}  {styled(frame_words(_frame(event)), bold=True)}"
     more = "…" if event.size > len(event.wire) else ""
     said = f" {event.wire.decode('ascii')!r}" if event.wire.isascii() and event.wire.decode().isprintable() else ""
     reason = styled(f"no frame ({event.reason})", fg="red")

@@ -30,7 +30,7 @@ def frame_words(message: Message) -> str:
 
 def frame_line(message: Message) -> str:
     """A `Decoded`: when, who to whom, what, and on which link."""
-    words = styled(printable(frame_words(message)), fg=_COLOURS.get(str(message.get("status"))), bold=True)
+    words = styled(frame_words(message), fg=_COLOURS.get(str(message.get("status"))), bold=True)
     return f"{_when(message)}  {_pair(message)}  {words}  {_dim(message.get('link'))}"
 
 
@@ -41,7 +41,7 @@ def raw_line(message: Message) -> str:
     detail = f" ({message['detail']})" if message.get("detail") else ""
     who = f"{_pair(message)}  {message.get('subject')}  " if message.get("source") is not None else ""
     colour = {"delivered": "green", "answered": "green"}.get(verdict, "red")
-    told = styled(printable(verdict + detail), fg=colour)
+    told = styled(verdict + detail, fg=colour)
     return (
         f"{_when(message)}  {printable(place)} {message.get('direction')}  {printable(who)}{told}"
         f"  {_dim(message.get('wire'))}"
@@ -79,4 +79,4 @@ def _clock(moment: datetime) -> str:
 
 
 def _dim(text: object) -> str:
-    return styled(printable(str(text)), dim=True)
+    return styled(str(text), dim=True)

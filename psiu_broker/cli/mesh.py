@@ -15,7 +15,7 @@ from psiu_broker.cli.output import (
     ago,
     milliseconds,
     on_terminal,
-    print_json,
+    print_models,
     print_rows,
     print_table,
     printable,
@@ -72,7 +72,7 @@ def mesh(connection: Connection, file: str | None) -> None:
     if not told:
         raise connection.nobody()
     if connection.as_json:
-        print_json([each.model_dump(mode="json") for each in told])
+        print_models(told)
     elif file is not None:
         _draw(composed(told), file)
     else:
@@ -102,9 +102,9 @@ def show_mesh(view: View, *, drawn: bool) -> None:
     rows = [_robot(each, answering) for each in view.robots]
     print_table(heads, rows, "No robot is announced yet. Ask who is there: psiu discover")
     for conflict in view.conflicts:
-        click.echo(styled(printable(_conflict(conflict)), fg="red"))
+        click.echo(styled(_conflict(conflict), fg="red"))
     for split in view.splits:
-        click.echo(styled(printable(_split(split)), fg="red"))
+        click.echo(styled(_split(split), fg="red"))
 
 
 def _draw(view: View, file: str) -> None:

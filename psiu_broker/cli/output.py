@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 import click
+from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -29,6 +30,11 @@ def on_terminal() -> bool:
 def print_json(value: Any) -> None:
     """One JSON value: indented for a reader at a terminal, else on one line."""
     click.echo(json.dumps(value, ensure_ascii=False, indent=2 if on_terminal() else None))
+
+
+def print_models(models: Iterable[BaseModel]) -> None:
+    """A JSON list, as `print_json`."""
+    print_json([model.model_dump(mode="json") for model in models])
 
 
 def print_line(value: Any) -> None:
@@ -87,7 +93,8 @@ def milliseconds(ms: float) -> str:
 
 
 def styled(text: str, **style: Any) -> str:
-    """`text` in a colour, where there is a terminal whose user wants colours."""
+    """`printable` text, in a colour where there is a terminal whose user wants colours."""
+    text = printable(text)
     return click.style(text, **style) if on_terminal() and not os.environ.get("NO_COLOR") else text
 
 

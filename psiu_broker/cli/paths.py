@@ -11,7 +11,7 @@ from psiu_broker.cli.output import (
     ago,
     milliseconds,
     on_terminal,
-    print_json,
+    print_models,
     print_rows,
     print_table,
     printable,
@@ -71,15 +71,15 @@ def why(connection: Connection, a: str, b: str, broker: str | None) -> None:
         raise connection.failure("no_broker", f"no broker {broker} answers; there is {', '.join(decisions)}")
     path = followed(decisions, broker)
     if connection.as_json:
-        print_json([hop.model_dump(mode="json") for hop in path.hops])
+        print_models(path.hops)
         return
     first = path.hops[0]
     colour = "green" if path.delivered else "red"
-    click.echo(styled(printable(f"{first.a} → {first.b} {path.verdict}"), fg=colour, bold=True))
+    click.echo(styled(f"{first.a} → {first.b} {path.verdict}", fg=colour, bold=True))
     several = len(path.hops) > 1 or path.broken is not None
     for hop in path.hops:
         if several:
-            click.echo(f"  {styled(printable(f'{hop.broker} {_outcome(hop)}'), bold=True)}")
+            click.echo(f"  {styled(f'{hop.broker} {_outcome(hop)}', bold=True)}")
         lines = [*hop.steps, *([facts] if (facts := _facts(hop)) else [])]
         for line in lines:
             click.echo(f"  {'  ' if several else ''}{printable(line)}")
@@ -104,7 +104,7 @@ def trace(connection: Connection, a: str, b: str) -> None:
     if not traces:
         raise connection.failure("unknown_robot", f"{a} is on no broker: psiu robots lists who is known")
     if connection.as_json:
-        print_json([each.model_dump(mode="json") for each in traces])
+        print_models(traces)
     for each in traces if not connection.as_json else ():
         show_trace(each, drawn=on_terminal())
     silent = next((each for each in traces if not each.answered), None)
@@ -136,7 +136,7 @@ def show_trace(trace: Trace, *, drawn: bool) -> None:
         return
     said = f"answered in {milliseconds(trace.total_ms)}" if trace.answered else "no answer"
     heading = f"{trace.a} → {trace.b} {trace.question}: {said}"
-    click.echo(styled(printable(heading), fg="green" if trace.answered else "red", bold=True))
+    click.echo(styled(heading, fg="green" if trace.answered else "red", bold=True))
     before = 0.0
     rows = []
     for hop in trace.hops:

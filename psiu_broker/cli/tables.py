@@ -7,7 +7,17 @@ import click
 
 from psiu_broker.cli.commands import Failure, examples
 from psiu_broker.cli.connection import Connection, connects
-from psiu_broker.cli.output import Cell, ago, on_terminal, print_json, print_rows, print_table, printable, styled
+from psiu_broker.cli.output import (
+    Cell,
+    ago,
+    on_terminal,
+    print_json,
+    print_models,
+    print_rows,
+    print_table,
+    printable,
+    styled,
+)
 from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status, Trunk
 from psiu_broker.profiles.psiu import QUESTIONS
 
@@ -33,7 +43,7 @@ def robots(connection: Connection) -> None:
         if not cards and not client.brokers():
             raise connection.nobody()
     if connection.as_json:
-        print_json([card.model_dump(mode="json") for card in cards])
+        print_models(cards)
     else:
         show_robots(cards, drawn=on_terminal())
 
@@ -180,7 +190,7 @@ def show_ledger(found: Ledgers, *, drawn: bool) -> None:
     for broker, each in found:
         sums = "arrived = delivered + answered + dropped + waiting"
         text = f"The books of {broker} balance: {sums}." if each.balances else f"The books of {broker}: {sums} FAILS."
-        click.echo(styled(printable(text), fg="green" if each.balances else "red"))
+        click.echo(styled(text, fg="green" if each.balances else "red"))
 
 
 def show_status(found: Iterable[tuple[Status, Health]]) -> None:
@@ -203,7 +213,7 @@ def show_status(found: Iterable[tuple[Status, Health]]) -> None:
         return
     for each, health in found:
         failed = ", ".join(name for name, good in health.checks.items() if not good)
-        click.echo(styled(printable(each.broker), bold=True) + f"  psiu-broker {printable(each.version)}")
+        click.echo(styled(each.broker, bold=True) + f"  psiu-broker {printable(each.version)}")
         click.echo(f"  started {ago(each.uptime_s)}, {each.started.astimezone():%Y-%m-%d %H:%M:%S}")
         click.echo(f"  {each.links_open} of {each.links} links open, {each.robots} robots known")
         click.echo(f"  programs connect to {printable(' '.join(each.listen))}")
