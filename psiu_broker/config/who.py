@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.tables import Configuration
 from psiu_broker.frame import Address, Frame, Way
-from psiu_broker.profiles import Node, describe
-from psiu_broker.profiles.describe import Description
+from psiu_broker.profiles import Description, Node, describe
 from psiu_broker.routing.table import Binding
 
 
