@@ -5,7 +5,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import sys
 import tempfile
 from collections.abc import AsyncIterator
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from ports import free_port
 
 CONFIGURATION = """
 [broker]
@@ -20,12 +20,6 @@ name = "{name}"
 [zenoh]
 listen = ["tcp/127.0.0.1:{port}"]
 """
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class BrokerProcess:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from lab_file import lab_text
+from ports import free_port
 
 from psiu_broker import broker as broker_module
 from psiu_broker import pulse
@@ -21,41 +23,6 @@ from psiu_broker.frame import MESH, Address, Way
 from psiu_broker.messages import Answer, CallRequest, Card
 from psiu_broker.routing.table import Route
 from psiu_broker.simulator import AsciiRobot, Extra, HexaRobot, PtyPort, UdpPort
-
-CONFIGURATION = """
-[broker]
-name = "base"
-[zenoh]
-listen = ["tcp/127.0.0.1:{bus}"]
-[links.radio]
-adapter = "serial"
-device = "{radio}"
-baudrate = 115200
-protocol = "psiu-ascii"
-timeout_s = 0.2
-[links.wifi]
-adapter = "udp"
-listen = "127.0.0.1:{wifi}"
-protocol = "psiu-ascii"
-[links.arm]
-adapter = "serial"
-device = "{arm}"
-baudrate = 115200
-protocol = "psiu-hexa"
-topology = "point-to-point"
-timeout_s = 0.2
-[robots.BRACO]
-address = 0x12
-link = "arm"
-nodes.garra = {{ node = 4, type = "servo" }}
-nodes.sonar = {{ node = 7, type = "distance", unit = "cm" }}
-"""
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
@@ -78,7 +45,7 @@ class Lab:
         self.arm = PtyPort(self.braco, link=folder / "arm")
         self.file = folder / "lab.toml"
         self.file.write_text(
-            CONFIGURATION.format(bus=free_port(), radio=self.radio.path, wifi=self.wifi, arm=self.arm.path)
+            lab_text(bus=free_port(), radio=self.radio.path, wifi=self.wifi, arm=self.arm.path, timeout_s=0.2)
         )
         self.broker = Broker(load(self.file))
 

@@ -7,7 +7,8 @@ from typing import Final
 
 import pytest
 from cable import Cable
-from test_broker import free_port, until
+from ports import free_port
+from test_broker import until
 
 from psiu_broker.broker import Broker
 from psiu_broker.config import load

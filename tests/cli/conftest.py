@@ -15,6 +15,8 @@ from typing import IO, Any
 
 import pytest
 from click.testing import CliRunner, Result
+from lab_file import lab_text
+from ports import free_port
 
 from psiu_broker.cli.daemon import psiu_broker
 from psiu_broker.cli.tool import psiu
@@ -22,27 +24,7 @@ from psiu_broker.cli.tool import psiu
 BIN = Path(sys.executable).parent
 PATIENCE_S = 20.0
 
-CONFIGURATION = """
-[broker]
-name = "base"
-[zenoh]
-listen = ["tcp/127.0.0.1:{bus}"]
-[links.radio]
-adapter = "serial"
-device = "{radio}"
-baudrate = 115200
-protocol = "psiu-ascii"
-[links.wifi]
-adapter = "udp"
-listen = "127.0.0.1:{wifi}"
-peers = ["127.0.0.1:{beta}"]
-protocol = "psiu-ascii"
-[links.arm]
-adapter = "serial"
-device = "{arm}"
-baudrate = 115200
-protocol = "psiu-hexa"
-topology = "point-to-point"
+MORE = """
 [links.lost]
 adapter = "serial"
 device = "/dev/serial/by-id/none"
@@ -50,11 +32,6 @@ protocol = "psiu-ascii"
 [trunks.hill]
 adapter = "serial"
 device = "socket://127.0.0.1:1"
-[robots.BRACO]
-address = 0x12
-link = "arm"
-nodes.garra = {{ node = 4, type = "servo" }}
-nodes.sonar = {{ node = 7, type = "distance", unit = "cm" }}
 """
 
 
@@ -123,12 +100,12 @@ class Lab:
 
     def __init__(self, folder: Path) -> None:
         wifi, beta = (free_port(socket.SOCK_DGRAM) for _ in range(2))
-        bus = free_port(socket.SOCK_STREAM)
+        bus = free_port()
         radio, arm = folder / "radio", folder / "arm"
         self.endpoint = f"tcp/127.0.0.1:{bus}"
         self.env = {"PSIU_CONNECT": self.endpoint}
         self.file = folder / "lab.toml"
-        self.file.write_text(CONFIGURATION.format(bus=bus, radio=radio, wifi=wifi, beta=beta, arm=arm))
+        self.file.write_text(lab_text(bus=bus, radio=radio, wifi=wifi, beta=beta, arm=arm) + MORE)
         extras = ("--command", "distancia:0=42", "--command", "trava:0=falha", "--command", "muda:0=", "--command")
         self.mnerim = Process("psiu", "sim", "--json", "--name", "MNERIM", "--pty", radio, *extras, "liga:1,0,1")
         self.beta = Process("psiu", "sim", "--json", "--name", "BETA", "--udp", f"127.0.0.1:{beta}")
@@ -156,12 +133,6 @@ class Lab:
     def close(self) -> None:
         for process in (self.broker, *self.robots):
             process.close()
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="session")
@@ -218,9 +189,9 @@ def daemon() -> Callable[..., Result]:
 @pytest.fixture
 def nowhere() -> str:
     """An endpoint where nobody listens."""
-    return f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
 def bus_port() -> int:
-    return free_port(socket.SOCK_STREAM)
+    return free_port()
