@@ -5,13 +5,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from datetime import UTC, datetime
-from types import SimpleNamespace
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
 import zenoh
+from quiet import Quiet
 
 from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.client import OPEN_TIMEOUT_S, Client
@@ -20,28 +19,23 @@ from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.session import Session
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Answer, CallRequest, Card, Status, Why
+from psiu_broker.messages import Answer, CallRequest, Card
 
 Until = Callable[[Callable[[], object]], Awaitable[None]]
 
 
-def status() -> Status:
-    started = datetime(2026, 11, 22, tzinfo=UTC)
-    return Status(
-        broker="base",
-        version="0",
-        started=started,
-        uptime_s=1,
-        links_open=0,
-        links=0,
-        robots=1,
-        zenoh_id="a",
-        listen=[],
-    )
-
-
 def card(robot: str) -> Card:
     return Card(robot=robot, protocol="psiu-ascii", broker="base", link="radio", link_state="open")
+
+
+class Source(Quiet):
+    """Two robots are here."""
+
+    def robots(self) -> Iterable[Address]:
+        return [Address.named(name) for name in ("PC", "MNERIM")]
+
+    def card(self, robot: Address) -> Card:
+        return card(str(robot))
 
 
 @pytest.fixture
@@ -61,20 +55,7 @@ async def broker(session: Session, keys: Keys, sent: list[Any]) -> AsyncIterator
     async def send(robot: Address, command: str, request: CallRequest) -> None:
         sent.append((robot, command, request))
 
-    source: Any = SimpleNamespace(
-        status=status,
-        links=list,
-        routes=list,
-        ledger=dict,
-        trunks=list,
-        mesh_seen=dict,
-        health=dict,
-        config=dict,
-        why=lambda a, b: Why(a=str(a), b=str(b), delivered=False, verdict="no_route", steps=[]),
-        robots=lambda: [Address.named(name) for name in ("PC", "MNERIM")],
-        card=lambda robot: card(str(robot)),
-    )
-    await Queries.open(session, keys, "base", source)
+    await Queries.open(session, keys, "base", Source())
     calls = await Calls.open(session, keys, call, send)
     yield session
     await calls.close()
@@ -117,7 +98,7 @@ async def test_a_broker_that_comes_a_little_later_is_waited_for(endpoint: str) -
 
 async def test_cards_and_brokers_come_as_models(client: Client) -> None:
     assert await asyncio.to_thread(client.cards) == [card("MNERIM"), card("PC")]
-    assert await asyncio.to_thread(client.brokers) == [status()]
+    assert await asyncio.to_thread(client.brokers) == [Source().status()]
 
 
 async def test_every_broker_can_be_asked(client: Client) -> None:

@@ -1,23 +1,21 @@
 import asyncio
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pytest
 import zenoh
+from quiet import NOW, Quiet
 
 from psiu_broker.bus import queries as queries_module
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.queries import Queries
 from psiu_broker.bus.session import Session
 from psiu_broker.frame import Address
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Mesh, Refusal, Route, Status, Trunk, Why
-
-NOW = datetime(2026, 11, 22, tzinfo=UTC)
+from psiu_broker.messages import Card, Link, Refusal, Trunk, Why
 
 
-class Broker:
+class Broker(Quiet):
     """A broker with three robots, one of them with an odd name; remembers whose cards it built."""
 
     def __init__(self) -> None:
@@ -25,40 +23,11 @@ class Broker:
         self.built: list[Address] = []
         self.listed = False
 
-    def status(self) -> Status:
-        return Status(
-            broker="base",
-            version="0",
-            started=NOW,
-            uptime_s=1,
-            links_open=1,
-            links=1,
-            robots=2,
-            zenoh_id="a",
-            listen=[],
-        )
-
     def links(self) -> Sequence[Link]:
         return [Link(name="radio", adapter="serial", protocol="psiu-ascii", state="open", since=NOW)]
 
     def trunks(self) -> Sequence[Trunk]:
         return [Trunk(name="hill", adapter="rfcomm", state="open", since=NOW, far="hill")]
-
-    def routes(self) -> Sequence[Route]:
-        return []
-
-    def ledger(self) -> Ledger:
-        total = Account(link="", arrived=0, delivered=0, answered=0)
-        return Ledger(accounts=[], total=total, balances=True)
-
-    def health(self) -> Health:
-        return Health(healthy=True, checks={})
-
-    def mesh_seen(self) -> Mesh:
-        return Mesh(broker="base", mode="peer", zenoh_id="b")
-
-    def config(self) -> Mapping[str, Any]:
-        return {"broker": {"name": "base"}}
 
     def why(self, a: Address, b: Address) -> Why:
         if a == Address.named("bug"):

@@ -4,11 +4,11 @@ import asyncio
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator
-from types import SimpleNamespace
+from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 import pytest
+from quiet import Quiet
 
 from psiu_broker.bus import session as session_module
 from psiu_broker.bus.calls import Calls
@@ -52,6 +52,13 @@ class Bus:
                     return behind
 
 
+class Wordy(Quiet):
+    """Whoever does not read what it says is soon stuck."""
+
+    def config(self) -> Mapping[str, Any]:
+        return {"long": "x" * 100_000}
+
+
 async def no_robot(*_: object) -> Any:
     raise CallError("unknown_robot", "no robot is known")
 
@@ -64,22 +71,12 @@ def stuck_s() -> float:
 @pytest.fixture
 async def bus(endpoint: str, keys: Keys, stuck_s: float, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Bus]:
     monkeypatch.setattr(session_module, "STUCK_S", stuck_s)
-    source: Any = SimpleNamespace(
-        status=dict,
-        links=list,
-        routes=list,
-        ledger=dict,
-        trunks=list,
-        mesh_seen=dict,
-        health=dict,
-        config=lambda: "x" * 100_000,
-    )
     session = await Session.open([endpoint])
     calls = await Calls.open(session, keys, no_robot, no_robot)
     yield Bus(
         session,
         await Publisher.open(session, keys, "base", lambda frame: {"kind": "command"}),
-        await Queries.open(session, keys, "base", source),
+        await Queries.open(session, keys, "base", Wordy()),
         await RoundTrip.open(session, keys, "base"),
     )
     await calls.close()
