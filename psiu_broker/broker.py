@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from psiu_broker import __version__
 from psiu_broker.bus.bus import Bus
-from psiu_broker.codecs import CODECS
+from psiu_broker.protocols import CODECS
 from psiu_broker.codecs.directories import Directories
 from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.psiu_hexa import PsiuHexa

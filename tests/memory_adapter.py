@@ -6,10 +6,10 @@ from typing import ClassVar
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from psiu_broker.adapter import Adapter, Peer, Receiver, Transport
-from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Codec, Directory
 from psiu_broker.config import LinkConfiguration, LinkOptions
 from psiu_broker.errors import LinkAbsent, LinkError
+from psiu_broker.protocols import CODECS
 
 
 class MemoryTransport(Transport):

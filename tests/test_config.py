@@ -124,7 +124,7 @@ def test_the_configuration_of_the_readme_loads_as_written(read):
     robot = configuration.robots["BRACO"]
     assert (robot.name, robot.link, robot.protocol) == ("BRACO", "arm", "psiu-hexa")
     assert robot.address == Address.numbered(0x12)
-    assert (robot.nodes["garra"].node, robot.nodes["garra"].type) == (4, "servo")
+    assert (robot.options.nodes["garra"].node, robot.options.nodes["garra"].type) == (4, "servo")
 
 
 def test_a_point_to_point_link_takes_its_ends_from_its_robot_and_the_broker(read):
@@ -236,7 +236,7 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
             RADIO + "strict = 'true'",
             'links.radio.strict: expected true or false, got "true"; write it without quotes: true',
         ),
-        (RADIO + "version = 1", "links.radio.version: expected '1', got 1; write it in quotes: \"1\""),
+        (RADIO + "version = 1", "links.radio.version: expected '1', '0.5' or '0', got 1; write it in quotes: \"1\""),
         (RADIO + "nak = 1", "links.radio.nak: expected true or false, got 1"),
         (RADIO + "max_age_s = 0", "links.radio.max_age_s: expected a number greater than 0, got 0"),
         (RADIO + "max_age_s = inf", "links.radio.max_age_s: expected a finite number, got inf"),

@@ -13,12 +13,12 @@ import pytest
 from pydantic import BaseModel, TypeAdapter
 
 from psiu_broker.cli import daemon, tool
-from psiu_broker.codecs import CODECS
 from psiu_broker.config import BrokerConfiguration, LinkOptions, MeshConfiguration, ZenohConfiguration, load
 from psiu_broker.config.tables import RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
 from psiu_broker.profiles import Node
+from psiu_broker.protocols import CODECS
 from psiu_broker.registry import adapter_class, adapter_names
 
 TREE = Path(__file__).parents[1]
@@ -110,7 +110,7 @@ def test_the_configurations_load(readme: str, tmp_path: Path) -> None:
         configuration = load(file)
         assert configuration.broker.name == "base"
     assert set(configuration.links) == {"radio", "wifi", "arm"}
-    assert configuration.robots["BRACO"].nodes["garra"].type == "servo"
+    assert configuration.robots["BRACO"].options.nodes["garra"].type == "servo"
 
 
 @READMES

@@ -12,10 +12,10 @@ from psiu_broker.cli.commands import examples
 from psiu_broker.cli.lines import frame_words
 from psiu_broker.cli.output import print_line, printable, styled
 from psiu_broker.cli.protocol_options import codec_options, given, protocol_options
-from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Codec, Directory, Event
 from psiu_broker.frame import Frame, Malformed
 from psiu_broker.profiles.describe import describe
+from psiu_broker.protocols import CODECS
 
 FOUND_WRONG: Final = 1
 """The exit code where something was no frame."""

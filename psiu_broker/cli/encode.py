@@ -9,11 +9,12 @@ import click
 from psiu_broker.cli.commands import Failure, WordsCommand, examples
 from psiu_broker.cli.output import print_json, printable
 from psiu_broker.cli.protocol_options import codec_options, given, protocol_options
-from psiu_broker.codecs import CODECS, psiu_ascii, psiu_hexa
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import Address, Frame
 from psiu_broker.profiles import hexa
+from psiu_broker.protocols import CODECS
 
 _BYTES: Final[Mapping[str, int]] = {
     "ack": hexa.ACK, "nak": hexa.NAK, "busy": hexa.BUSY,

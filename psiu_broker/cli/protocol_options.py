@@ -8,7 +8,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from psiu_broker.cli.commands import number, parsed
-from psiu_broker.codecs import CODECS
+from psiu_broker.protocols import CODECS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 
 from psiu_broker.cli.commands import Failure, examples, number, parsed
 from psiu_broker.cli.sim_journal import Journal
-from psiu_broker.codecs import CODECS
 from psiu_broker.profiles.node import Node
+from psiu_broker.protocols import CODECS
 from psiu_broker.simulator import QUIRKS, AsciiRobot, Extra, Faults, HexaRobot, Port, PtyPort, Robot, UdpPort
 from psiu_broker.simulator.port import Observer
 

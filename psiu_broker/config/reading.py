@@ -6,12 +6,11 @@ import re
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import BaseModel
 
 from psiu_broker.adapter import Adapter, Peer
-from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.checks import (
     check_devices,
@@ -33,11 +32,19 @@ from psiu_broker.config.tables import (
     RobotTable,
     TrunkConfiguration,
     ZenohConfiguration,
+    domain_of,
     robot_name,
 )
 from psiu_broker.errors import ConfigurationError
 from psiu_broker.frame import Address
+from psiu_broker.profiles.hexa import HexaOptions
+from psiu_broker.profiles.persona import PersonaOptions
+from psiu_broker.protocols import CODECS, PROTOCOLS
 from psiu_broker.registry import UnknownAdapter, adapter_class, adapter_names
+
+_ROBOT_WORDS: Final = frozenset(RobotTable.model_fields).union(
+    *(protocol.profile.Options.model_fields for protocol in PROTOCOLS.values())
+)
 
 
 def load(path: Path) -> Configuration:
@@ -126,15 +133,18 @@ def _link(
         codec = problems.read(codec_model, mine, key)
         if adapter and isinstance(codec, PsiuHexa.Options):
             check_far_end(adapter, codec, table, key, problems)
+    persona = _persona(table, protocol, key, problems) if options and options.plays is not None else None
     if adapter_model and codec_model:
         models: tuple[type[BaseModel], ...] = (adapter_model, codec_model, LinkOptions)
         known = {"adapter", "protocol"}.union(*(model.model_fields for model in models))
+        if "plays" in table:
+            known.add("map")
         for word in table:
             if word not in known:
                 problems.unknown((*key, word), known)
     if len(problems.lines) > before or not (adapter_name and adapter and protocol and codec and options):
         return None
-    return LinkConfiguration(name, adapter_name, adapter, protocol, codec, options)
+    return LinkConfiguration(name, adapter_name, adapter, protocol, codec, options, persona)
 
 
 def _trunk(name: str, value: object, problems: Problems) -> TrunkConfiguration | None:
@@ -235,27 +245,70 @@ def _robot(
     at = table.get("link")
     if isinstance(at, str) and at not in links:
         problems.add((*key, "link"), f"there is no link {got(at)}; {suggestion(at, links) if links else 'add one'}")
-    robot = problems.read(RobotTable, table, key)
+    robot = problems.read(RobotTable, _share(table, RobotTable), key)
+    for word in table:
+        if word not in RobotTable.model_fields and not _owners(word):
+            problems.unknown((*key, word), _ROBOT_WORDS)
     link = links.get(robot.link) if robot else None
     if robot is None or link is None:
         return None
-    address = None
-    if isinstance(link.codec, PsiuHexa.Options):
-        if robot.address is None:
-            problems.add(
-                (*key, "address"), f"missing; link {link.name} speaks psiu-hexa, whose robots are numbers 0–255"
-            )
-            return None
-        address = Address.numbered(robot.address, link.codec.domain)
-        check_nodes(robot.nodes, key, problems)
-    else:
-        for word in ("address", "nodes", "sensor_reply"):
-            if word in table:
-                problems.add((*key, word), f"is for psiu-hexa, and link {link.name} speaks {link.protocol}; remove it")
+    protocol = PROTOCOLS[link.protocol]
+    model = protocol.profile.Options
+    _refuse_of_others(table, link, key, problems)
+    options = problems.read(model, _share(table, model), key)
+    address = _address(robot, link, key, problems)
+    if isinstance(options, HexaOptions):
+        check_nodes(options.nodes, key, problems)
     peer: Peer = None
     if robot.peer is not None:
         try:
             peer = link.adapter.peer_named(robot.peer)
         except ValueError as error:
             problems.add((*key, "peer"), str(error))
-    return RobotConfiguration(name, robot.link, link.protocol, address, peer, robot.nodes, robot.sensor_reply)
+    if options is None:
+        return None
+    return RobotConfiguration(name, robot.link, link.protocol, address, peer, options)
+
+
+def _address(robot: RobotTable, link: LinkConfiguration, key: Key, problems: Problems) -> Address | None:
+    """The number of a robot whose protocol has numbers."""
+    numbers = PROTOCOLS[link.protocol].numbers
+    if numbers is None:
+        if robot.address is not None:
+            whose = " and ".join(name for name, each in PROTOCOLS.items() if each.numbers is not None)
+            problems.add((*key, "address"), f"is for {whose}, and link {link.name} speaks {link.protocol}; remove it")
+        return None
+    known = numbers(link.codec)
+    whose = f"link {link.name} speaks {link.protocol}, whose robots are numbers {known.start}–{known.stop - 1}"
+    if robot.address is None:
+        problems.add((*key, "address"), f"missing; {whose}")
+    elif robot.address not in known:
+        problems.add((*key, "address"), f"got {robot.address}; {whose}")
+    else:
+        return Address.numbered(robot.address, domain_of(link))
+    return None
+
+
+def _refuse_of_others(table: Mapping[str, Any], link: LinkConfiguration, key: Key, problems: Problems) -> None:
+    """Note the words of `table` that are for robots of other protocols than the link's."""
+    for word in table:
+        owners = _owners(word)
+        if owners and link.protocol not in owners:
+            whose = " and ".join(owners)
+            problems.add((*key, word), f"is for {whose}, and link {link.name} speaks {link.protocol}; remove it")
+
+
+def _owners(word: str) -> list[str]:
+    """The protocols whose robots may have the option `word`."""
+    return [name for name, each in PROTOCOLS.items() if word in each.profile.Options.model_fields]
+
+
+def _persona(table: dict[str, Any], protocol: str | None, key: Key, problems: Problems) -> PersonaOptions | None:
+    """What the robot that is played looks like on a link; None where it is of the link's own protocol."""
+    persona = PROTOCOLS[protocol].persona if protocol else None
+    if "map" not in table or protocol is None:
+        return None
+    if persona is None:
+        problems.add((*key, "map"), f"is not for {protocol}: a robot is played in it as it is; remove it")
+        return None
+    return problems.read(persona.Options, table["map"], (*key, "map"))

@@ -4,7 +4,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from psiu_broker.codecs import CODECS
 from psiu_broker.config.tables import (
     LINK_NAME,
     BrokerConfiguration,
@@ -13,6 +12,7 @@ from psiu_broker.config.tables import (
     RobotTable,
     ZenohConfiguration,
 )
+from psiu_broker.protocols import CODECS, PROTOCOLS
 from psiu_broker.registry import adapter_class, adapter_names
 
 
@@ -36,6 +36,7 @@ def json_schema() -> dict[str, Any]:
             "adapter": {"enum": adapter_names(), "description": "how the link is reached"},
             "protocol": {"enum": sorted(CODECS), "description": "what its robots speak"},
             **schema(LinkOptions)["properties"],
+            "map": {"anyOf": [schema(each.persona.Options) for each in PROTOCOLS.values() if each.persona] or [{}]},
         },
         "required": ["adapter", "protocol"],
         "allOf": [only_if("adapter", name, adapter_class(name)) for name in adapter_names()]
@@ -50,6 +51,10 @@ def json_schema() -> dict[str, Any]:
         "allOf": [only_if("adapter", name, adapter_class(name)) for name in streams],
         "unevaluatedProperties": False,
     }
+    robot = schema(RobotTable)
+    for protocol in PROTOCOLS.values():
+        # Which of them a robot may have depends on its link, and that no schema can follow.
+        robot["properties"] |= schema(protocol.profile.Options).get("properties", {})
     names = {"pattern": f"^{LINK_NAME.pattern}$"}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -65,7 +70,7 @@ def json_schema() -> dict[str, Any]:
                 "additionalProperties": link,
             },
             "trunks": {"type": "object", "propertyNames": names, "additionalProperties": trunk},
-            "robots": {"type": "object", "additionalProperties": schema(RobotTable)},
+            "robots": {"type": "object", "additionalProperties": robot},
         },
         "required": ["broker"],
         "additionalProperties": False,

@@ -17,7 +17,7 @@ def shown(configuration: Configuration) -> dict[str, Any]:
             robot.name: {
                 "link": robot.link,
                 "address": None if robot.address is None else robot.address.number,
-                "nodes": {name: node.model_dump(mode="json") for name, node in robot.nodes.items()},
+                **robot.options.model_dump(mode="json"),
             }
             for robot in configuration.robots.values()
         },
@@ -35,4 +35,5 @@ def _link(link: LinkConfiguration) -> dict[str, Any]:
         "protocol": link.protocol,
         **link.codec.model_dump(mode="json"),
         **link.options.model_dump(mode="json"),
+        **({} if link.map is None else {"map": link.map.model_dump(mode="json")}),
     }

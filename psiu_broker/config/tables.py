@@ -10,7 +10,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.config.problems import got
 from psiu_broker.frame import EVERYONE, Address
-from psiu_broker.profiles.hexa import Node
+from psiu_broker.profiles.persona import PersonaOptions
+from psiu_broker.profiles.profile import RobotOptions
 
 
 def robot_name(name: str) -> str:
@@ -75,7 +76,6 @@ Endpoints = Annotated[
 Others = Annotated[tuple[Endpoint, ...], AfterValidator(_once), Field(json_schema_extra={"uniqueItems": True})]
 Prefix = Annotated[str, AfterValidator(_prefix)]
 Number = Annotated[int, Field(ge=0, le=255)]
-SensorReply = Literal["node-0", "bit7"]
 Seconds = Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)]
 
 
@@ -120,18 +120,15 @@ class LinkOptions(_Table):
     avr_limits: bool = Field(False, description="the robots have an AVR's small buffers: warn before exceeding them")
     wildcard: bool = Field(True, description="frames to ?? are sent on this link")
     greet: bool = Field(True, description="ask who is there when the link opens")
+    plays: str | None = Field(None, description="the robot that programs at the far end find there, and command")
 
 
 class RobotTable(_Table):
-    """``[robots.NAME]`` as it is written."""
+    """What may be written in every ``[robots.NAME]``, whatever the protocol of its link."""
 
     link: str = Field(description="the name of its link")
-    address: Number | None = Field(None, description="its PSIU HEXA address")
+    address: Number | None = Field(None, description="its address, where its protocol knows robots by numbers")
     peer: str | None = Field(None, description='where it is on its link; "host:port" over UDP')
-    nodes: dict[str, Node] = Field({}, description="PSIU HEXA: names for its nodes")
-    sensor_reply: SensorReply = Field(
-        "node-0", description="PSIU HEXA: how its sensors answer, as node 0, or as themselves with bit 7 set"
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +142,13 @@ class LinkConfiguration:
     codec: BaseModel
     """The `Options` of ``CODECS[protocol]``."""
     options: LinkOptions
+    map: PersonaOptions | None = None
+    """What the robot that `options.plays` names looks like there, in the `Persona.Options` of the protocol."""
+
+
+def domain_of(link: LinkConfiguration) -> str:
+    """Within what the numbers of a link's robots are unique: what the user says, or the link itself."""
+    return str(getattr(link.codec, "domain", link.name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +162,7 @@ class TrunkConfiguration:
 
 @dataclass(frozen=True, slots=True)
 class RobotConfiguration:
-    """A robot that the user named: its link, its PSIU HEXA address where it has one, and its nodes."""
+    """A robot that the user named: where it is, its address where it has one, and what its profile is to know."""
 
     name: str
     link: str
@@ -166,8 +170,8 @@ class RobotConfiguration:
     address: Address | None
     peer: Peer
     """As the link's adapter knows it, ``(host, port)`` over UDP; None where the file leaves it out."""
-    nodes: Mapping[str, Node]
-    sensor_reply: SensorReply
+    options: RobotOptions
+    """The `Options` of its protocol's profile."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,14 @@
 """Who is who by the configuration: the broker's own addresses, and what its author calls robots and their nodes."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+from psiu_broker.adapter import Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config.tables import Configuration
-from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.config.tables import Configuration, LinkConfiguration, domain_of
+from psiu_broker.frame import Address, Frame, Way, peer_text
 from psiu_broker.profiles import Description, Node, describe
+from psiu_broker.profiles.hexa import HexaOptions
 from psiu_broker.routing.table import Binding
 
 
@@ -33,12 +36,44 @@ def names(configuration: Configuration) -> Mapping[Address, Address]:
     return own | {robot.address: Address.named(robot.name) for robot in robots if robot.address is not None}
 
 
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Who is at both ends of a link whose packets do not say."""
+
+    link: str
+    own: Address
+    """What we are there: the broker, or the robot that it plays."""
+    plays: bool
+    domain: str
+    """Within what the numbers in its packets are unique."""
+    robots: Mapping[Peer, Address]
+    """The robots that the configuration puts there, by their far ends; by None, the one that may be at any."""
+
+    def far(self, peer: Peer) -> Address:
+        """Who is at the far end `peer`; named after the link where the configuration does not say."""
+        known = self.robots.get(peer) or self.robots.get(None)
+        if known is not None:
+            return known
+        return Address.named(self.link if peer is None else f"{self.link}@{peer_text(peer)}")
+
+
+def ends(configuration: Configuration, link: LinkConfiguration) -> Ends:
+    """Who is on `link`, as far as the configuration tells."""
+    plays = link.options.plays
+    here = [robot for robot in configuration.robots.values() if robot.link == link.name and robot.address is None]
+    alone = len([robot for robot in here if robot.peer is None]) == 1
+    robots = {robot.peer: Address.named(robot.name) for robot in here if robot.peer is not None or alone}
+    return Ends(
+        link.name, Address.named(plays or configuration.broker.name), plays is not None, domain_of(link), robots
+    )
+
+
 def describer(configuration: Configuration) -> Callable[[Frame], Description]:
     """How to say a frame in words, with the names that the configuration gives to nodes."""
     named: dict[Address, dict[int, tuple[str, Node]]] = {
-        robot.address: {node.node: (name, node) for name, node in robot.nodes.items()}
+        robot.address: {node.node: (name, node) for name, node in robot.options.nodes.items()}
         for robot in configuration.robots.values()
-        if robot.address is not None
+        if robot.address is not None and isinstance(robot.options, HexaOptions)
     }
     nothing: dict[int, tuple[str, Node]] = {}
     return lambda frame: describe(frame, lambda address: named.get(address, nothing))

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from psiu_broker.codecs import CODECS
+from psiu_broker.protocols import CODECS
 from psiu_broker.codecs.checksums import CHECKS
 from psiu_broker.codecs.codec import Directory, Event
 from psiu_broker.codecs.fragments import LONGEST_PAYLOAD, REASSEMBLY_S
