@@ -130,14 +130,12 @@ class DescriptorTransport(Transport):
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
-            self._stop()
-            self._say_lost(self._lost(error))
+            self._lose(error)
             return
         if data:
             self._received(data, self._peer)
         else:
-            self._stop()
-            self._say_lost(LinkLost(f"{self._name}: gone (unplugged or disconnected)"))
+            self._lose()
 
     def _flush(self) -> None:
         """The descriptor has room: finish the frame that was cut, then say so."""
@@ -147,8 +145,7 @@ class DescriptorTransport(Transport):
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
-                self._stop()
-                self._say_lost(self._lost(error))
+                self._lose(error)
                 return
             if self._rest:
                 return
@@ -174,8 +171,16 @@ class DescriptorTransport(Transport):
         if not self._closed:
             self._receiver.lost(error)
 
-    def _lost(self, error: OSError) -> LinkLost:
-        reason = "unplugged or disconnected" if error.errno in UNPLUGGED else os.strerror(error.errno or 0).lower()
+    def _lose(self, error: OSError | None = None) -> None:
+        """The far end is gone, by `error` or by end of file."""
+        self._stop()
+        self._say_lost(self._lost(error))
+
+    def _lost(self, error: OSError | None) -> LinkLost:
+        if error is None or error.errno in UNPLUGGED:
+            reason = "unplugged or disconnected"
+        else:
+            reason = os.strerror(error.errno or 0).lower()
         return LinkLost(f"{self._name}: gone ({reason})")
 
     def _stop(self) -> None:
