@@ -5,7 +5,6 @@ from pydantic import ValidationError
 
 from psiu_broker.frame import Address
 from psiu_broker.mesh.beat import Beat, Notice, digest
-from psiu_broker.mesh.mesh import Tokens
 from psiu_broker.routing.claims import Claim
 
 
@@ -57,44 +56,3 @@ def test_a_digest_does_not_depend_on_the_order(claims: list[Claim]) -> None:
 def test_any_difference_shows_in_the_digest() -> None:
     digests = {digest(claims) for claims in ([], [claim("A")], [claim("A", 2)], [claim("B")], [claim("A"), claim("B")])}
     assert len(digests) == 5
-
-
-# Tokens: what another broker has declared.
-
-
-def test_a_claim_that_is_renewed_is_declared_before_the_old_one_goes() -> None:
-    tokens = Tokens()
-    tokens.add(claim("MNERIM", 1))
-    tokens.add(claim("MNERIM", 2))
-    assert tokens.remove(claim("MNERIM", 1)) == claim("MNERIM", 2)
-    assert tokens.digest == digest([claim("MNERIM", 2)])
-    assert tokens.remove(claim("MNERIM", 2)) is None
-    assert tokens.digest == digest(())
-
-
-def test_while_all_is_declared_anew_every_claim_stands_twice_and_is_one() -> None:
-    tokens = Tokens()
-    tokens.add(claim("MNERIM"))
-    tokens.add(claim("MNERIM"))
-    assert tokens.digest == digest([claim("MNERIM")])
-    assert tokens.remove(claim("MNERIM")) == claim("MNERIM")
-    assert list(tokens) == [claim("MNERIM")]
-
-
-def test_what_was_never_declared_can_be_withdrawn() -> None:
-    tokens = Tokens()
-    assert tokens.remove(claim("MNERIM")) is None
-    tokens.add(claim("MNERIM", 2))
-    assert tokens.remove(claim("MNERIM", 1)) == claim("MNERIM", 2)
-
-
-def test_what_is_not_declared_anew_when_all_is_was_withdrawn_long_ago() -> None:
-    tokens = Tokens()
-    tokens.add(claim("OLD"))
-    tokens.add(claim("MNERIM"))
-    tokens.ask(0.0)
-    tokens.add(claim("MNERIM"))
-    assert set(tokens.sweep()) == {Address.named("OLD"), Address.named("MNERIM")}
-    assert list(tokens) == [claim("MNERIM")]
-    assert tokens.find(Address.named("OLD")) is None
-    assert tokens.sweep() == []
