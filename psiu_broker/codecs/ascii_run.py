@@ -3,7 +3,7 @@
 import re
 from bisect import bisect_left
 from itertools import accumulate
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 LONGEST: Final = 999
 """Bytes of the longest frame: what three digits can say."""
@@ -12,8 +12,6 @@ COMPLAINT_TEXT: Final = b"CHECKSUM NAO BATEU!"
 
 SIZE_FIELD: Final = re.compile(rb" (\d{3}) ")
 CHECKSUM_FIELD: Final = re.compile(rb" (\d{5})")
-_UNPADDED: Final = re.compile(rb" (\d{4})")
-_ENDING: Final = re.compile(CHECKSUM_FIELD.pattern + b"|" + re.escape(COMPLAINT_TEXT))
 
 _SPACE: Final = 0x20
 _HELD: Final = 4096
@@ -26,18 +24,22 @@ class Fit(NamedTuple):
 
     start: int
     field: int
-    """The size field's first space."""
-    space: int
-    """The space before the checksum."""
+    """Where the name before the size ends."""
+    tail: int
+    """Where all that the checksum is set behind ends."""
     end: int
     exact: bool
 
     def moved(self, by: int) -> "Fit":
-        return Fit(self.start + by, self.field + by, self.space + by, self.end + by, self.exact)
+        return Fit(self.start + by, self.field + by, self.tail + by, self.end + by, self.exact)
 
 
 class Run:
     """A run of printable bytes as far as it is not settled; holds at most 4096 bytes and what one `read` adds."""
+
+    ENDING: ClassVar[re.Pattern[bytes]] = re.compile(CHECKSUM_FIELD.pattern + b"|" + re.escape(COMPLAINT_TEXT))
+    """What a frame ends in, its digits a group, or a complaint."""
+    UNPADDED: ClassVar[re.Pattern[bytes]] = re.compile(rb" (\d{4})\Z")
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
@@ -66,7 +68,7 @@ class Run:
         """Lengthen the run."""
         self._sums += accumulate(text, initial=self._sums.pop())
         self.text += text
-        for ending in _ENDING.finditer(self.text, self._endings_from):
+        for ending in self.ENDING.finditer(self.text, self._endings_from):
             self._endings_from = ending.end()
             if ending[1] is not None:
                 self._add_fits(ending)
@@ -77,24 +79,19 @@ class Run:
 
     def read_unpadded(self) -> None:
         """The run ends at a boundary: what it ends in may be a checksum that lacks its zero."""
-        ending = _UNPADDED.fullmatch(self.text, max(0, len(self.text) - 5))
+        ending = self.UNPADDED.search(self.text, max(0, len(self.text) - 5))
         if ending is not None and not self._strict:
             self._add_fits(ending)
 
     def next(self, *, ended: bool) -> Fit | None:
         """The first fit that nothing before it can still overrule; `ended`: nothing more comes."""
         if self._field is None:
-            field = SIZE_FIELD.search(self.text, self._fields_from)
-            if field is None:
-                self._fields_from = max(self._fields_from, len(self.text) - 4)
-            else:
-                self._field = field.start()
-                self._claimed = self._field - 1 + int(field[1])
+            self._find_field()
         if not self.fits:
             return None
         first_field = len(self.text) if self._field is None else self._field
         for fit in self.fits:
-            if fit.end <= first_field or (fit.exact and fit.start < first_field):
+            if fit.end <= first_field or (fit.exact and fit.field <= first_field):
                 return fit
         return self.fits[0] if ended or self._claimed <= len(self.text) else None
 
@@ -134,24 +131,39 @@ class Run:
 
     def _add_fits(self, ending: re.Match[bytes]) -> None:
         """Note the frames with this ending: at most two, since 999 printable bytes wrap the sum at most once."""
-        text, sums = self.text, self._sums
-        space, end = ending.span()
+        sums = self._sums
+        digits, end = ending.span(1)
         checksum = int(ending[1])
         if checksum > 0xFFFF:
             return
         first = max(self.settled, end - LONGEST)
-        for before in (sums[space + 1] - checksum - 0x10000, sums[space + 1] - checksum):
-            start = bisect_left(sums, before, first, space)
-            if sums[start] != before or text[start] == _SPACE:
-                continue
-            field = SIZE_FIELD.search(text, start + 1, space)
-            if field is None or text[field.start() - 1] == _SPACE or text[field.end()] == _SPACE:
-                continue
-            if not field.end() < text.rfind(b" ", 0, space) < space - 1:
-                continue
-            exact = len(ending[1]) == 5 and int(field[1]) == end - start
-            if exact or (not self._strict and self._may_begin(start)):
-                self.fits.append(Fit(start, field.start(), space, end, exact))
+        for before in (sums[digits] - checksum - 0x10000, sums[digits] - checksum):
+            start = bisect_left(sums, before, first, digits - 1)
+            if sums[start] == before and self.text[start] != _SPACE:
+                fit = self._fit(start, digits, end)
+                if fit is not None and (fit.exact or not self._strict):
+                    self.fits.append(fit)
+
+    def _find_field(self) -> None:
+        """Set `_field` and what it claims, or note how far there is none."""
+        field = SIZE_FIELD.search(self.text, self._fields_from)
+        if field is None:
+            self._fields_from = max(self._fields_from, len(self.text) - 4)
+        else:
+            self._field = field.start()
+            self._claimed = self._field - 1 + int(field[1])
+
+    def _fit(self, start: int, digits: int, end: int) -> Fit | None:
+        """The frame from `start` whose checksum is the text from `digits` to `end`, if that has all its parts."""
+        text = self.text
+        tail = digits - 1
+        field = SIZE_FIELD.search(text, start + 1, tail)
+        if field is None or text[field.start() - 1] == _SPACE or text[field.end()] == _SPACE:
+            return None
+        if not field.end() < text.rfind(b" ", 0, tail) < tail - 1:
+            return None
+        exact = end - digits == 5 and int(field[1]) == end - start
+        return Fit(start, field.start(), tail, end, exact) if exact or self._may_begin(start) else None
 
     def _may_begin(self, start: int) -> bool:
         """Whether a word begins at `start`: behind a space, a frame or a complaint, or with the run."""

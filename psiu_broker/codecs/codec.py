@@ -16,11 +16,13 @@ Event = Frame | Malformed
 class Directory:
     """The robots that the broker knows of now. Codecs only read it; it changes under them.
 
-    `names` are those with spaces in them, to settle where such a name begins; `numbers` (of one domain) tells a found
-    PSIU HEXA packet from noise whose CRC fits by luck.
+    `names` are those with spaces in them, to settle where such a name begins; `all_names` are all of them, our own
+    too, to settle where the drafts of PSIU ASCII end one; `numbers` (of one domain) tells a found PSIU HEXA packet
+    from noise whose CRC fits by luck.
     """
 
     names: set[str] = field(default_factory=set)
+    all_names: set[str] = field(default_factory=set)
     numbers: set[int] = field(default_factory=set)
 
 
@@ -36,6 +38,8 @@ class Codec(ABC):
     """True while bytes wait for more."""
     silence_s: float
     """A silence this long ends whatever was begun: the link then calls `flush`."""
+    paced: ClassVar[bool] = False
+    """True where robots are told what to do at a fixed rate, all in one packet: see `paced.PacedCodec`."""
     addressed: bool = True
     """False: its packets name nobody, or only a number within the packet; the link knows who is at its ends."""
     remembers: ClassVar[bool] = False

@@ -19,7 +19,8 @@ silence (`RIPE_S`), and never swallows them. At a boundary the checksum may lack
 
 All of this depends on the bytes alone, so however the stream is cut, the frames are the same. A
 few thousand bytes are held at most, and an ending is looked into once. `ascii_run.Run` finds the
-fits; the codec makes frames of them.
+fits (`draft_run` those of the drafts before the document, which leave out spaces and the sender);
+the codec makes frames of them.
 """
 
 import re
@@ -28,12 +29,13 @@ from typing import ClassVar, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from psiu_broker.codecs.ascii_run import CHECKSUM_FIELD, COMPLAINT_TEXT, LONGEST, SIZE_FIELD, Fit, Run
+from psiu_broker.codecs.ascii_run import COMPLAINT_TEXT, LONGEST, SIZE_FIELD, Fit, Run
 from psiu_broker.codecs.checksums import byte_sum
 from psiu_broker.codecs.codec import Codec, Directory, Event
+from psiu_broker.codecs.draft_run import LONGEST_NAME, DraftRun, SenderlessRun
 from psiu_broker.codecs.noise import NOISE, Noise
 from psiu_broker.errors import EncodeError
-from psiu_broker.frame import COMPLAINT, Address, Frame, Malformed
+from psiu_broker.frame import COMPLAINT, NOBODY, Address, Frame, Malformed
 
 __all__ = ["PsiuAscii", "message"]
 
@@ -43,8 +45,8 @@ RIPE_S: Final = 0.02
 """The silence that decides for a whole frame held back by the claim of an earlier size field."""
 
 _CANONICAL: Final = "psiu-ascii/1"
-_LOOSE: Final = "psiu-ascii/1/loose"
-_CRLF: Final = "psiu-ascii/1/crlf"
+_SIZE_BYTES: Final = len(b" ddd ")
+_DRAFT_SIZE_BYTES: Final = len(b"ddd")
 
 _BAD_CHECKSUM: Final = "checksum"
 _BAD_SIZE: Final = "size"
@@ -52,6 +54,7 @@ _UNFINISHED: Final = "unfinished"
 
 _PIECE: Final = re.compile(rb"([ -~]+)|([\r\n]+)|[^ -~\r\n]+")
 _PRINTABLE: Final = re.compile(rb"[!-~][ -~]*")
+_DIGITS: Final = b"0123456789"
 _MISREAD: Final = re.compile(rb" \d{3}( |\Z)")
 
 _SIZES: Final = tuple(b"%03d" % size for size in range(LONGEST + 1))
@@ -93,7 +96,9 @@ class PsiuAscii(Codec):
 
         model_config = ConfigDict(extra="forbid", frozen=True)
 
-        version: Literal["1"] = Field("1", description="the draft of the protocol; 1 is the document")
+        version: Literal["1", "0.5", "0"] = Field(
+            "1", description="1 is the document; 0.5 and 0 are its drafts, and frames of 0 name no sender"
+        )
         strict: bool = Field(False, description="refuse frames with a wrong size or a checksum without its zero")
         line_end: Literal["none", "crlf"] = Field(
             "none", description="what follows a frame that is sent; robots want none"
@@ -102,16 +107,25 @@ class PsiuAscii(Codec):
 
     def __init__(self, options: Options, directory: Directory, *, datagrams: bool = False) -> None:
         self.options = options
-        self.dialect = _CANONICAL if options.line_end == "none" else _CRLF
+        self._canonical = f"{PROTOCOL}/{options.version}"
+        self.dialect = self._canonical if options.line_end == "none" else f"{self._canonical}/crlf"
+        self.addressed = options.version != "0"
         self.silence_s = self._silence_s = options.silence_ms / 1000
         self._directory = directory
         self._names: dict[bytes, Address] = {}
         self._subjects: dict[bytes, str] = {}
-        self._run = Run(strict=options.strict)
+        self._draft: DraftRun | None = None
+        if options.version != "1":
+            reader = DraftRun if self.addressed else SenderlessRun
+            self._draft = reader(directory, strict=options.strict)
+        self._run = self._draft or Run(strict=options.strict)
         self._noise = Noise()
 
     def whole(self, data: bytes) -> Frame | None:
-        """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case."""
+        """The frame, if `data` is one whole canonical frame of names and a command heard before: the common case.
+
+        None in the drafts, since they remember no command.
+        """
         try:
             destination, size, rest = data.split(b" ", 2)
             if size != _SIZES[len(data)]:
@@ -166,21 +180,30 @@ class PsiuAscii(Codec):
         Raises:
             EncodeError: a name or word cannot be said in printable ASCII, would be read as another, or all is too long.
         """
-        wire = frame.wire if frame.wire and frame.dialect == _CANONICAL else self._encoded(frame)
-        return wire if self.dialect == _CANONICAL else wire + b"\r\n"
+        wire = frame.wire if frame.wire and frame.dialect == self._canonical else self._encoded(frame)
+        return wire if self.dialect == self._canonical else wire + b"\r\n"
 
     def _encoded(self, frame: Frame) -> bytes:
         if frame.protocol != PROTOCOL:
             raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
         destination = _name(frame.destination)
+        if self._draft is not None:
+            return self._encoded_draft(frame, destination, self._draft)
         if _MISREAD.search(destination, 1):
             raise EncodeError(f"{frame.destination}: three digits alone in a name would be read as the size")
-        body = b"%b %b " % (_words(frame.payload, "a message"), _name(frame.source))
-        size = len(destination) + 5 + len(body) + 5
-        if size > LONGEST:
-            raise EncodeError(f"the frame would have {size} bytes, of which three digits can only say {LONGEST}")
-        summed = destination + b" %b " % _SIZES[size] + body
-        return b"%b%05d" % (summed, byte_sum(summed))
+        return _ended(destination, b" %b ", b"%b %b " % (_words(frame.payload, "a message"), _name(frame.source)))
+
+    def _encoded_draft(self, frame: Frame, destination: bytes, draft: DraftRun) -> bytes:
+        if len(destination) > LONGEST_NAME:
+            raise EncodeError(f"{frame.destination}: the drafts have room for {LONGEST_NAME} bytes of a name")
+        message = b"%b " % _words(frame.payload, "a message")
+        wire = _ended(destination, b"%b", message + _name(frame.source) if self.addressed else message)
+        read = draft.name_end(wire, 0, len(wire))
+        if read != len(destination):
+            raise EncodeError(
+                f"{frame.destination}: with the size behind it, it would be read as {wire[:read].decode()}"
+            )
+        return wire
 
     def _take_whole(self, data: bytes, events: list[Event]) -> int:
         """Take the `whole` frames that `data` begins with; where the rest begins.
@@ -250,15 +273,19 @@ class PsiuAscii(Codec):
         wire = bytes(self._run.text[fit.start : fit.end])
         text = wire.decode("ascii")
         field = fit.field - fit.start
-        end = fit.space - fit.start
-        sender = self._sender(text, field + 6, text.rindex(" ", 0, end), end)
-        payload = wire[field + 5 : sender]
-        dialect, remark = _CANONICAL, ""
+        end = fit.tail - fit.start
+        message = field + (_SIZE_BYTES if self._draft is None else _DRAFT_SIZE_BYTES)
+        source = NOBODY
+        payload = wire[message:end]
+        if self.addressed:
+            sender = self._sender(text, message + 1, text.rindex(" ", 0, end), end)
+            source = self._address(wire[sender + 1 : end])
+            payload = wire[message:sender]
+        dialect, remark = self._canonical, ""
         if not fit.exact:
-            dialect = _LOOSE
-            unpadded = fit.end - fit.space < 6
-            remark = "checksum not padded" if unpadded else f"size {text[field + 1 : field + 4]}, not {len(wire):03}"
-        source = self._address(wire[sender + 1 : end])
+            dialect = f"{self._canonical}/loose"
+            unpadded = len(wire[end:].lstrip()) < 5
+            remark = "checksum not padded" if unpadded else f"size {text[field:message].strip()}, not {len(wire):03}"
         destination = self._address(wire[:field])
         return Frame(source, destination, self._subject(payload), payload, PROTOCOL, wire, dialect, remark)
 
@@ -272,6 +299,8 @@ class PsiuAscii(Codec):
 
     def _subject(self, payload: bytes) -> str:
         word = payload.split(b" ", 1)[0]
+        if self._draft is not None:
+            return word.decode("ascii")
         subject = self._subjects.get(word)
         if subject is None:
             if len(self._subjects) >= _MOST_WORDS:
@@ -290,14 +319,24 @@ class PsiuAscii(Codec):
     def _reason(self) -> str:
         """Why the noise was no frame, as far as it looks like one."""
         kept = bytes(self._noise.kept)
-        if self._noise.size > LONGEST or not (field := SIZE_FIELD.search(kept, 1)):
+        field = SIZE_FIELD.search(kept, 1) if self._draft is None else self._draft.size_field(kept)
+        if self._noise.size > LONGEST or not field:
             return NOISE
-        summed = kept.rfind(b" ") + 1
+        summed = kept.rfind(b" ") + 1 if self._draft is None else max(len(kept.rstrip(_DIGITS)), len(kept) - 5)
         ending = kept[summed:]
         if len(ending) == 5 and ending.isdigit() and byte_sum(kept[:summed]) == int(ending):
             return _BAD_SIZE
         looks_whole = len(ending) == 4 and ending.isdigit()
-        return _BAD_CHECKSUM if looks_whole or CHECKSUM_FIELD.search(kept, field.end() - 1) else _UNFINISHED
+        return _BAD_CHECKSUM if looks_whole or self._run.ENDING.search(kept, field.end(1)) else _UNFINISHED
+
+
+def _ended(destination: bytes, size: bytes, rest: bytes) -> bytes:
+    """A whole frame: its length written as `size` says, and `rest` with its checksum behind it."""
+    length = len(destination) + len(size % b"ddd") + len(rest) + 5
+    if length > LONGEST:
+        raise EncodeError(f"the frame would have {length} bytes, of which three digits can only say {LONGEST}")
+    summed = destination + size % _SIZES[length] + rest
+    return b"%b%05d" % (summed, byte_sum(summed))
 
 
 def _name(address: Address) -> bytes:

@@ -5,15 +5,14 @@ from typing import Any
 
 import pytest
 
-from psiu_broker.codecs import CODECS
 from psiu_broker.codecs.codec import Directory, Event
 from psiu_broker.codecs.psiu_ascii import RIPE_S, PsiuAscii, message
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import COMPLAINT, EVERYONE, MALFORMED_KEPT, Address, Frame, Malformed
+from psiu_broker.protocols import CODECS
 
 VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "psiu-ascii.json").read_text())
 V1 = [vector for vector in VECTORS["frames"] if vector["dialect"] == "v1"]
-DRAFTS = [vector for vector in VECTORS["frames"] if vector["dialect"] != "v1"]
 TOLERATED = {"valid", "wrong-size", "unpadded-checksum"}
 FRAME = b"MNERIM 034 parafrente 100 PC 02123"
 OTHER = b"PC 038 parafrente sucesso MNERIM 02755"
@@ -65,11 +64,6 @@ def check(vector: dict[str, Any], frame: Frame) -> None:
 
 def accepted(vector: dict[str, Any], *, strict: bool) -> bool:
     return vector["verdict"] == "valid" if strict else vector["verdict"] in TOLERATED
-
-
-def test_the_vectors_of_drafts_0_and_0_5_wait_for_the_codec_of_those_drafts() -> None:
-    assert {vector["dialect"] for vector in DRAFTS} == {"v0", "v0.5"}
-    assert len(V1) + len(DRAFTS) == len(VECTORS["frames"])
 
 
 @pytest.mark.parametrize("strict", [False, True], ids=["tolerant", "strict"])
