@@ -1,4 +1,4 @@
-"""A simulated robot that speaks PSIU ASCII v1, as the document has it or as the authors' firmware does."""
+"""A simulated robot that speaks PSIU ASCII, as the document or its drafts have it or as the authors' firmware does."""
 
 import math
 from collections import deque
@@ -8,7 +8,7 @@ from random import Random
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, get_args
 
-from psiu_broker.simulator.ear import Ear, Sentence
+from psiu_broker.simulator.ear import DraftEar, Ear, Sentence, WordEar
 from psiu_broker.simulator.robot import Heard, Reply, Robot
 
 Quirk = Literal[
@@ -24,6 +24,8 @@ Quirk = Literal[
     "answers_any",
     "odd_index",
 ]
+
+Version = Literal["1", "0.5", "0"]
 
 QUIRKS: Final[Mapping[Quirk, str]] = MappingProxyType(
     {
@@ -121,7 +123,7 @@ class AsciiRobot(Robot):
     A motion takes `answer_s` plus `per_unit_s` a centimetre or degree, one after the other; its
     answer follows it. What is asked of everyone (``??``) is answered after a random time up to
     `wildcard_delay_s` (robots on one line must not speak at once). Telemetry is ``posicao x y
-    heading`` to `telemetry_to`.
+    heading`` to `telemetry_to`; in draft 0, whose frames name no sender, so is every answer.
     """
 
     protocol = "psiu-ascii"
@@ -130,6 +132,7 @@ class AsciiRobot(Robot):
         self,
         name: str,
         *,
+        version: Version = "1",
         quirks: Collection[Quirk] = (),
         extras: Sequence[Extra] = (),
         per_unit_s: float = 0.0,
@@ -151,6 +154,7 @@ class AsciiRobot(Robot):
         if unknown:
             raise ValueError(f"there is no quirk {min(unknown)!r} (known: {', '.join(QUIRKS)})")
         self.name = name
+        self.version = version
         self.quirks: frozenset[Quirk] = frozenset(quirks)
         self.position = Position()
         self.telemetry_s = telemetry_s
@@ -164,14 +168,7 @@ class AsciiRobot(Robot):
         questions = [Extra(word, ints=count) for word, count in _QUESTIONS.items()]
         self.commands: tuple[Extra, ...] = (*motions, *questions, *extras)
         self._known = {command.name: command for command in self.commands}
-        counts = {c.name: c.ints + c.floats + c.chars for c in self.commands}
-        avr = "avr" in self.quirks
-        self._ear = Ear(
-            counts,
-            ruined_by_crlf="ruined_by_crlf" in self.quirks,
-            word_bytes=AVR_WORD_BYTES if avr else 999,
-            greatest_sum=AVR_SUM if avr else 65535,
-        )
+        self._ear = self._new_ear()
         self._last_byte = -math.inf
         self._lose = 0
         self._counted = False
@@ -181,6 +178,20 @@ class AsciiRobot(Robot):
         self._legs: deque[_Leg] = deque()
         self._goal = self.position
         self._free_at = -math.inf
+
+    def _new_ear(self) -> Ear:
+        ruined_by_crlf = "ruined_by_crlf" in self.quirks
+        avr = "avr" in self.quirks
+        greatest_sum = AVR_SUM if avr else 65535
+        if self.version != "1":
+            sender = self._telemetry_to if self.version == "0" else None
+            return DraftEar(self.name, sender=sender, ruined_by_crlf=ruined_by_crlf, greatest_sum=greatest_sum)
+        return WordEar(
+            {command.name: command.ints + command.floats + command.chars for command in self.commands},
+            ruined_by_crlf=ruined_by_crlf,
+            word_bytes=AVR_WORD_BYTES if avr else 999,
+            greatest_sum=greatest_sum,
+        )
 
     def receive(self, data: bytes, now: float) -> list[Reply]:
         self.advance(now)
@@ -226,12 +237,14 @@ class AsciiRobot(Robot):
         Raises:
             ValueError: it would be longer than the 999 bytes of the format, or is not Latin text.
         """
-        rest = f" {' '.join(map(str, words))} {self.name} "
-        size = len(destination) + 1 + 3 + len(rest) + 5
+        around = " " if self.version == "1" else ""
+        sender = "" if self.version == "0" else self.name + around
+        rest = f"{around}{' '.join(map(str, words))} {sender}"
+        size = len(destination) + len(around) + 3 + len(rest) + 5
         if size > 999:
             raise ValueError(f"a frame of {size} bytes: PSIU ASCII has room for 999")
         claimed = size - 2 if "wrong_size" in self.quirks else size
-        body = f"{destination} {claimed:03d}{rest}".encode("latin-1")
+        body = f"{destination}{around}{claimed:03d}{rest}".encode("latin-1")
         checksum = sum(body) % 65536
         frame = body + (b"%d" if "unpadded" in self.quirks else b"%05d") % checksum
         if "junk" in self.quirks and self._counted:

@@ -4,6 +4,8 @@ It shares nothing with the broker's codec on purpose: a robot that had the broke
 prove nothing about the broker.
 """
 
+import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -23,8 +25,20 @@ class Sentence(NamedTuple):
     intact: bool
 
 
-class Ear:
-    """Reads one line byte by byte.
+class Ear(ABC):
+    """Reads one line byte by byte."""
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Begin anew."""
+
+    @abstractmethod
+    def take(self, byte: int) -> Sentence | None:
+        """The frame that `byte` completes, if it completes one."""
+
+
+class WordEar(Ear):
+    """Reads the document's form, whose parts have spaces between them.
 
     `parameter_counts` (of the robot's own commands) says where a checksum is due; in a frame of
     another command the first word of five digits counts as one. A word over `word_bytes` spoils
@@ -41,7 +55,6 @@ class Ear:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
         self._words: list[str] = []
         self._word = bytearray()
         self._sum = 0
@@ -49,7 +62,6 @@ class Ear:
         self._overflow = False
 
     def take(self, byte: int) -> Sentence | None:
-        """The frame that `byte` completes, if it completes one."""
         if not self._size and (byte == _SPACE or byte in _LINE_ENDS):
             if self._ruined_by_crlf and byte != _SPACE:
                 self._sum += byte
@@ -85,3 +97,49 @@ class Ear:
         if overflow:
             return None
         return Sentence(" ".join(words[:place]), words[-1], command, tuple(words[place + 2 : -1]), intact)
+
+
+class DraftEar(Ear):
+    """Reads a draft: the name of the robot (or whoever a frame is for) and the size without a space between them.
+
+    With a `sender`, the frames name none (draft 0) and are taken to come from that one.
+    """
+
+    def __init__(self, name: str, *, sender: str | None, ruined_by_crlf: bool, greatest_sum: int) -> None:
+        self._own = (name, "??")
+        self._head = re.compile(rf"({re.escape(name)}|\?\?|[^\d ]+)(\d{{3}})")
+        self._sender = sender
+        self._ruined_by_crlf = ruined_by_crlf
+        self._greatest_sum = greatest_sum
+        self.forget()
+
+    def forget(self) -> None:
+        self._text = ""
+        self._ruin = 0
+
+    def take(self, byte: int) -> Sentence | None:
+        if byte in _LINE_ENDS:
+            self.forget()
+            self._ruin = byte if self._ruined_by_crlf else 0
+            return None
+        self._text = (self._text + chr(byte))[-LONGEST_FRAME:]
+        digits = self._text[-CHECKSUM_DIGITS:]
+        if len(digits) < CHECKSUM_DIGITS or not digits.isdigit():
+            return None
+        return self._judge(int(digits))
+
+    def _judge(self, checksum: int) -> Sentence | None:
+        """The first frame that ends here."""
+        text = self._text
+        for start in range(len(text) - CHECKSUM_DIGITS):
+            head = self._head.match(text, start)
+            if head is None:
+                continue
+            total = sum(text[start:-CHECKSUM_DIGITS].encode("latin-1")) + self._ruin
+            intact = total % 65536 == checksum and total <= self._greatest_sum
+            ends_here = head[1] in self._own and int(head[2]) == len(text) - start
+            *words, sender = text[head.end() : -CHECKSUM_DIGITS].split(" ")
+            if words and (intact or ends_here) and bool(sender) == (self._sender is None):
+                self.forget()
+                return Sentence(head[1], self._sender or sender, words[0], tuple(words[1:]), intact)
+        return None
