@@ -21,13 +21,12 @@ from typing import Any, Final
 
 from psiu_broker import __version__
 from psiu_broker.bus.bus import Bus
-from psiu_broker.protocols import CODECS
 from psiu_broker.codecs.directories import Directories
 from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config import Configuration, LinkConfiguration
 from psiu_broker.config.shown import shown
-from psiu_broker.config.who import bindings, own_addresses
+from psiu_broker.config.who import bindings, ends, own_addresses
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange, NoBus
 from psiu_broker.frame import MESH, Address, Frame, Way
@@ -41,6 +40,8 @@ from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Rout
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
+from psiu_broker.profiles import Description
+from psiu_broker.protocols import CODECS
 from psiu_broker.pulse import Pulse
 from psiu_broker.report import Report
 from psiu_broker.resident import DISCOVER, Resident
@@ -88,6 +89,7 @@ class Broker:
             self._robot_gone,
             duplicates,
             self._ownership,
+            [link.name for link in configuration.links.values() if link.options.plays is not None],
         )
         self.exchange = Exchange(Address.named(name), router)
         self._qualities = Qualities()
@@ -217,6 +219,9 @@ class Broker:
     def cards(self) -> Mapping[Address, Card]:
         return self.report.cards()
 
+    def describe(self, frame: Frame) -> Description:
+        return self.resident.describe(frame)
+
     async def call(self, robot: Address, command: str, request: CallRequest) -> Answer | None:
         """None: another broker has the robot, and answers."""
         if self._is_elsewhere(robot):
@@ -318,10 +323,15 @@ class Broker:
     def _link(self, configuration: LinkConfiguration) -> Link:
         options = configuration.codec
         domain = options.domain if isinstance(options, PsiuHexa.Options) else ""
-        unaddressed = isinstance(options, PsiuHexa.Options) and options.topology != "ad-hoc"
         codec = CODECS[configuration.protocol]
         directory = self._directories.of(domain)
-        return Link(configuration, lambda: codec(options, directory), self.exchange, unaddressed=unaddressed)
+        return Link(
+            configuration,
+            lambda: codec(options, directory, datagrams=configuration.adapter.datagrams),
+            self.exchange,
+            unaddressed=isinstance(options, PsiuHexa.Options) and options.topology != "ad-hoc",
+            ends=ends(self.configuration, configuration),
+        )
 
     # Inside: the bus, opened and kept open.
 

@@ -16,8 +16,9 @@ from psiu_broker.errors import CallCode, CallError
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import EVERYONE, MESH, Address, Frame
 from psiu_broker.messages import Answer, CallRequest, Command
-from psiu_broker.profiles import HexaProfile, Profile, PsiuProfile
-from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, listed
+from psiu_broker.profiles import Description, Profile, PsiuProfile, Request
+from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, canonical, listed, typed
+from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.routing.router import SELF
 from psiu_broker.routing.table import Route
 from psiu_broker.routing.verdicts import DELIVERED, LINK_DOWN, Verdict
@@ -126,6 +127,9 @@ class Calling:
         link = self._exchange.links[route.way.link]
         if link.state != "open":
             raise CallError("link_down", f"{route.robot} is on link {link.name}, which is {link.state}: {link.reason}")
+        told = _listing(command, parameters, route, self.commands(route))
+        if told is not None and route.protocol != psiu_ascii.PROTOCOL:
+            return told
         options = link.configuration.options
         return await self.conversations.call(
             self._robot(route),
@@ -139,6 +143,28 @@ class Calling:
 
     def commands(self, route: Route) -> Sequence[Command]:
         return self._profile(route).commands()
+
+    def greet(self, route: Route) -> None:
+        """Tell the robot what its profile greets it with."""
+        robot = self._robot(route)
+        for request in robot.profile.greeting():
+            self._exchange.send(robot.build(request), self._clock())
+
+    def learn(self, frame: Frame) -> None:
+        """Take note of what a robot says, whether it answers a call or not."""
+        route = self._router.find(frame.source)
+        if route is None or route.way.link in (MESH, SELF.link) or route.protocol != frame.protocol:
+            return
+        if self._profile(route).learn(frame):
+            self.greet(route)
+
+    def describe(self, frame: Frame) -> Description | None:
+        """What the profile of the robot that sent `frame`, or is to have it, reads there; None where nobody knows."""
+        for address in (frame.source, frame.destination):
+            route = self._router.find(address)
+            if route is not None and route.protocol == frame.protocol and route.way.link not in (MESH, SELF.link):
+                return self._profile(route).describe(frame)
+        return None
 
     def robot_heard(self, route: Route) -> None:
         for address in route.addresses:
@@ -181,22 +207,15 @@ class Calling:
         """Who we are to the robot, who it is to us, and how a request becomes a frame between us."""
         name, profile, way = str(route.robot), self._profile(route), route.way
         codec = self._exchange.links[way.link].configuration.codec
-        if isinstance(codec, PsiuHexa.Options):
-            number = next(address for address in route.addresses if address.is_numbered)
-            own = Address.numbered(codec.local, codec.domain)
-            return Robot(
-                name, own, number, profile, lambda it: psiu_hexa.packet(own, number, it.payload), way.link, way.peer
-            )
-        own, address = self.name, route.robot
-        return Robot(
-            name,
-            own,
-            address,
-            profile,
-            lambda it: psiu_ascii.message(own, address, *it.payload.decode("ascii").split(" ")),
-            way.link,
-            way.peer,
-        )
+        own = Address.numbered(codec.local, codec.domain) if isinstance(codec, PsiuHexa.Options) else self.name
+        address = next((each for each in route.addresses if each.is_numbered), route.robot)
+
+        def build(request: Request) -> Frame:
+            if route.protocol == psiu_ascii.PROTOCOL:
+                return psiu_ascii.message(own, address, *request.payload.decode("ascii").split(" "))
+            return Frame(own, address, request.subject, request.payload, route.protocol)
+
+        return Robot(name, own, address, profile, build, way.link, way.peer)
 
     def _profile(self, route: Route) -> Profile:
         """What the robot of `route` understands; kept for as long as the robot is known."""
@@ -206,13 +225,11 @@ class Calling:
         return profile
 
     def _make_profile(self, route: Route) -> Profile:
-        options = self._exchange.links[route.way.link].configuration.options
-        if route.protocol == "psiu-hexa":
-            robot = self._robots.get(route.robot)
-            if robot is None:
-                return HexaProfile({}, options.timeout_s)
-            return HexaProfile(robot.nodes, options.timeout_s, robot.sensor_reply)
-        return PsiuProfile(timeout_s=options.timeout_s)
+        link = self._exchange.links[route.way.link].configuration
+        profile = PROTOCOLS[route.protocol].profile
+        robot = self._robots.get(route.robot)
+        options = robot.options if robot is not None else profile.Options()
+        return profile.make(link.codec, options, link.options.timeout_s, datagrams=link.adapter.datagrams)
 
     async def _told(self, command: str, request: CallRequest) -> Answer:
         """A call to the broker itself."""
@@ -296,7 +313,8 @@ class Calling:
         try:
             profile = self._profile(route)
             if not isinstance(profile, PsiuProfile):
-                await self.ask(route, "ping")
+                if route.protocol == psiu_hexa.PROTOCOL:
+                    await self.ask(route, "ping")
                 return
             count = await self.ask(route, COUNT)
             total = next((value for value in count.values if isinstance(value, int)), 0)
@@ -307,6 +325,22 @@ class Calling:
                     profile.learn_command(command)
         except CallError as error:
             log.info("asking %s for its commands: %s", route.robot, error)
+
+
+def _listing(command: str, parameters: Sequence[Any], route: Route, commands: Sequence[Command]) -> Answer | None:
+    """What the robot of `route`, which has no words, would answer to a question about its name and its commands."""
+    match canonical(command), [typed(each) if isinstance(each, str) else each for each in parameters]:
+        case "qualseunome", []:
+            return Answer(values=[str(route.robot)], elapsed_ms=0.0)
+        case "quantoscomandos", []:
+            return Answer(values=[len(commands)], elapsed_ms=0.0)
+        case "exibecomando", [int(index)]:
+            if not 1 <= index <= len(commands):
+                return Answer(status="falha", elapsed_ms=0.0)
+            shown = commands[index - 1]
+            return Answer(values=[shown.name, shown.ints, shown.floats, shown.chars], elapsed_ms=0.0)
+        case _:
+            return None
 
 
 def _elsewhere(route: Route) -> CallError:

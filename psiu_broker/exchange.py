@@ -226,6 +226,18 @@ class Exchange:
             self.resident.delivered(frame, now)
         return verdict
 
+    def send_by(self, frame: Frame, way: Way, now: float) -> Verdict | None:
+        """As `send`, but by `way`, wherever its destination is known to be."""
+        account = self.accounts[SELF.link]
+        account.arrived += 1
+        self.router.sent(frame, now)
+        if self.bus.listened:
+            self._publish(frame, (way,), SELF)
+        verdict = self._spread(frame, (way,), SELF, now)
+        if verdict is not None:
+            account.fates[verdict] += 1
+        return verdict
+
     def ask_names(self, link: Link, now: float, *, told: bool = False) -> None:
         """Ask everyone on one link who they are; unless we were told to, only where our allowance has room."""
         self._ask_on(EVERYONE, link.ways(), now, told=told)

@@ -15,6 +15,7 @@ from psiu_broker.adapter import Peer, Transport
 from psiu_broker.codecs.avr import avr_trouble
 from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration
+from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import Address, Frame, Malformed, Way
 from psiu_broker.kept import FIRST_PAUSE_S, Kept
@@ -72,8 +73,13 @@ class Link(Kept):
         hub: Hub,
         *,
         unaddressed: bool = False,
+        ends: Ends | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Make the link, closed.
+
+        `unaddressed`: answers do not say for whom they are; `ends`: who is there, where packets do not say it.
+        """
         super().__init__(configuration.name, configuration.adapter, clock)
         self.configuration = configuration
         self.codec = codec()
@@ -82,8 +88,10 @@ class Link(Kept):
         self.last_heard: float | None = None
         self.last_sent = -inf
         self.outbox = Outbox(configuration.options.queue_frames)
-        self._askers = Askers() if unaddressed else None
+        self._ends_named = None if self.codec.addressed else ends
+        self._askers = Askers() if unaddressed or self._ends_named is not None else None
         self._make_codec = codec
+        self._in_pieces = configuration.adapter.datagrams and type(self.codec).pieces is not Codec.pieces
         self._hub = hub
         self._warned: set[Address] = set()
         self._avr_limits = configuration.options.avr_limits
@@ -119,7 +127,7 @@ class Link(Kept):
         self.expire(now)
         full: set[Peer] = set()
         while self._transport is not None and (parcel := self.outbox.take(full)) is not None:
-            if self._transport.write(parcel.wire, parcel.peer):
+            if self._write(self._transport, parcel.wire, parcel.peer):
                 self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
@@ -169,7 +177,7 @@ class Link(Kept):
                 return REFUSED
         if self._avr_limits:
             self._warn_of_avr(frame, wire)
-        if not (self.outbox.size and self.outbox.waits_for(peer)) and transport.write(wire, peer):
+        if not (self.outbox.size and self.outbox.waits_for(peer)) and self._write(transport, wire, peer):
             self._sent(frame, wire, peer, now)
             return DELIVERED
         if self._transport is None:
@@ -226,15 +234,32 @@ class Link(Kept):
             if isinstance(event, Frame):
                 self.frames_in += 1
                 self.last_heard = now
-                self._hub.heard(event if self._askers is None else self._addressed(event, now), way, now)
+                self._hub.heard(event if self._askers is None else self._addressed(event, way, now), way, now)
             else:
                 self.malformed += 1
                 self._hub.malformed(event, way, now)
 
-    def _addressed(self, frame: Frame, now: float) -> Frame:
+    def _addressed(self, frame: Frame, way: Way, now: float) -> Frame:
         """`frame` of a link whose packets do not say for whom they are: for who asked last, if anybody did."""
+        ends = self._ends_named
+        if ends is not None:
+            frame = ends.named(frame, way.peer)
+            if ends.plays or frame.destination != ends.own:
+                return frame
         asker = self._askers.of(frame.source, now) if self._askers is not None else None
         return frame if asker is None else frame._replace(destination=asker)
+
+    def _write(self, transport: Transport, wire: bytes, peer: Peer) -> bool:
+        """As `Transport.write`; where a frame leaves in several datagrams, those after the first may be lost."""
+        if not self._in_pieces:
+            return transport.write(wire, peer)
+        first, *rest = self.codec.pieces(wire) or (wire,)
+        if not transport.write(first, peer):
+            return False
+        for piece in rest:
+            if self._transport is not None:
+                transport.write(piece, peer)
+        return True
 
     def _warn_of_avr(self, frame: Frame, wire: bytes) -> None:
         trouble = avr_trouble(wire) if frame.protocol == "psiu-ascii" else None
@@ -244,7 +269,7 @@ class Link(Kept):
             log.warning("link %s: %s may not understand %s: %s", self.name, frame.destination, frame.subject, trouble)
 
     def _end(self, peer: Peer) -> _End:
-        codec = self.codec if self.adapter.datagrams else self._make_codec()
+        codec = self.codec if self.adapter.datagrams and not self.codec.remembers else self._make_codec()
         end = self._ends[peer] = _End(Way(self.name, peer), codec)
         return end
 

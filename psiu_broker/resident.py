@@ -9,15 +9,17 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from psiu_broker.calling import DISCOVER, Calling
-from psiu_broker.codecs import psiu_hexa
+from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.psiu_hexa import BAD_CHECK, PsiuHexa
 from psiu_broker.config import Configuration
+from psiu_broker.config.who import describer
 from psiu_broker.errors import CallError
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import COMPLAINT, EVERYONE, Address, Frame, Malformed, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest, Command
-from psiu_broker.profiles import Responder
+from psiu_broker.playing import Playing
+from psiu_broker.profiles import Description, Responder
 from psiu_broker.profiles.hexa import NAK
 from psiu_broker.profiles.psiu import NAME, said
 from psiu_broker.profiles.rarely import Rarely
@@ -35,6 +37,8 @@ NAME_WITHIN_S: Final = 2.0
 """How long after our question a name is its answer."""
 NAK_EVERY_S: Final = 0.1
 TASKS_KEPT: Final = 64
+_TALKING: Final = frozenset({psiu_ascii.PROTOCOL, psiu_hexa.PROTOCOL})
+"""The protocols in which the broker is a robot among others, with a name or a number of its own."""
 
 
 @dataclass(slots=True)
@@ -57,6 +61,8 @@ class Resident:
         self._clock = clock
         self._calling = Calling(configuration, exchange, clock)
         self._conversations = self._calling.conversations
+        self._playing = Playing(configuration, exchange, self._calling, clock)
+        self._describe = describer(configuration)
         self._responder = Responder(configuration.broker.name)
         self._tasks: set[asyncio.Task[None]] = set()
         self._naks = Rarely()
@@ -69,6 +75,9 @@ class Resident:
     # exchange.Resident
 
     def answer(self, frame: Frame, way: Way, now: float) -> None:
+        if frame.protocol not in _TALKING:
+            self._hear(frame, now)
+            return
         if self._conversations.heard(frame, now) or self._says_its_name(frame, way, now):
             return
         reply = self._responder.answer(frame, now, self._conversations.pinging(frame.source))
@@ -82,6 +91,11 @@ class Resident:
             self._exchange.send(reply, now)
 
     def translate(self, frame: Frame, way: Way, now: float) -> Verdict:
+        played = self._playing.heard(frame, way, now)
+        if played is not None:
+            return played
+        if frame.protocol != psiu_ascii.PROTOCOL:
+            return REFUSED
         route = self._router.find(frame.destination)
         if route is None or len(self._tasks) >= TASKS_KEPT:
             return REFUSED
@@ -113,7 +127,13 @@ class Resident:
     def link_opened(self, link: Link, now: float) -> None:
         """Greet, as far as our allowance on the link goes: robots are to be known before anybody needs them."""
         options = link.configuration.options
+        self._playing.link_opened(link, now)
         if not options.greet:
+            return
+        if link.codec.protocol not in _TALKING:
+            for route in self._router.robots():
+                if route.way.link == link.name:
+                    self._calling.greet(route)
             return
         if link.codec.protocol == "psiu-ascii" and options.wildcard:
             self._exchange.ask_names(link, now)
@@ -125,21 +145,33 @@ class Resident:
                 self._start(self._greet(route))
 
     def link_closed(self, link: Link, now: float) -> None:
+        self._playing.link_closed(link.name)
         self._conversations.link_down(link.name, link.reason or "closed")
 
     def peer_lost(self, way: Way, now: float) -> None:
+        self._playing.peer_lost(way)
         self._conversations.link_down(way.link, "its far end is gone", way.peer)
 
     # What the broker tells us.
 
     def robot_heard(self, route: Route) -> None:
         self._calling.robot_heard(route)
+        link = self._exchange.links.get(route.way.link)
+        if link is not None and link.adapter.datagrams and route.protocol not in _TALKING:
+            # When the link opened, nobody was there to be greeted.
+            self._calling.greet(route)
 
     def robot_gone(self, route: Route) -> None:
         self._calling.robot_gone(route)
 
     def commands(self, route: Route) -> Sequence[Command]:
         return self._calling.commands(route)
+
+    def describe(self, frame: Frame) -> Description:
+        """What a frame says, in the words of `messages.Decoded`."""
+        if frame.protocol in _TALKING:
+            return self._describe(frame)
+        return self._calling.describe(frame) or {"kind": "command", "command": frame.subject}
 
     async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
         """Raises CallError, as `Calling.call` does."""
@@ -152,11 +184,18 @@ class Resident:
     async def close(self) -> None:
         """End every call, and wait for what the broker itself was asking."""
         self._conversations.close()
+        await self._playing.close()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # Inside.
+
+    def _hear(self, frame: Frame, now: float) -> None:
+        """A frame of a robot that knows nothing of us: perhaps an answer, perhaps something to pass on."""
+        self._calling.learn(frame)
+        if not self._conversations.heard(frame, now):
+            self._playing.told(frame, self.describe(frame), now)
 
     def _says_its_name(self, frame: Frame, way: Way, now: float) -> bool:
         """Whether `frame` answers our qualseunome or ping: its sender's first on the link where we just asked.

@@ -26,6 +26,7 @@ from psiu_broker.frame import Address, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest
 from psiu_broker.profiles import Node
+from psiu_broker.profiles.hexa import HexaOptions
 from psiu_broker.profiles.rarely import REMEMBERED
 from psiu_broker.profiles.responder import NAMES_AT_ONCE
 from psiu_broker.resident import TASKS_KEPT, Resident
@@ -85,7 +86,7 @@ class Lab:
         if any(link.name == "arm" for link in links):
             number = Address.numbered(0x12)
             own[Address.numbered(0)] = "psiu-hexa"
-            robots[braco] = RobotConfiguration(braco, "arm", "psiu-hexa", number, None, NODES, "node-0")
+            robots[braco] = RobotConfiguration(braco, "arm", "psiu-hexa", number, None, HexaOptions(nodes=NODES))
             bindings = (Binding(Address.named(braco), number, Way("arm"), "psiu-hexa"),)
         if any(link.name == "field" for link in links):
             own[Address.numbered(0)] = "psiu-hexa"

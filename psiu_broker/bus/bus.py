@@ -13,12 +13,13 @@ from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session, plain
 from psiu_broker.bus.traces import Traces
 from psiu_broker.config import Configuration
-from psiu_broker.config.who import describer, names
+from psiu_broker.config.who import names
 from psiu_broker.errors import BusError
-from psiu_broker.frame import Address
+from psiu_broker.frame import Address, Frame
 from psiu_broker.mesh.mesh import Mesh
 from psiu_broker.mesh.probe import Probed
 from psiu_broker.messages import Answer, CallRequest, Trace
+from psiu_broker.profiles import Description
 
 
 class Served(Source, Protocol):
@@ -26,6 +27,9 @@ class Served(Source, Protocol):
 
     @property
     def mesh(self) -> Mesh: ...
+
+    def describe(self, frame: Frame) -> Description:
+        """As `publisher.Describe`."""
 
     async def call(self, robot: Address, command: str, request: CallRequest) -> Answer | None:
         """As `calls.Call`."""
@@ -90,7 +94,7 @@ class Bus:
         try:
             return cls(
                 session,
-                await Publisher.open(session, keys, name, describer(configuration), names(configuration)),
+                await Publisher.open(session, keys, name, broker.describe, names(configuration)),
                 await ZenohMesh.open(session, keys, name, broker.mesh),
                 await Calls.open(session, keys, broker.call, broker.send, relayed=mesh.mode == "router"),
                 await Queries.open(session, keys, name, broker),

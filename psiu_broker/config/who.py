@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from psiu_broker.adapter import Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.tables import Configuration, LinkConfiguration, domain_of
-from psiu_broker.frame import Address, Frame, Way, peer_text
+from psiu_broker.frame import NOBODY, Address, Frame, Way, peer_text
 from psiu_broker.profiles import Description, Node, describe
 from psiu_broker.profiles.hexa import HexaOptions
 from psiu_broker.routing.table import Binding
@@ -48,6 +48,17 @@ class Ends:
     """Within what the numbers in its packets are unique."""
     robots: Mapping[Peer, Address]
     """The robots that the configuration puts there, by their far ends; by None, the one that may be at any."""
+
+    def named(self, frame: Frame, peer: Peer) -> Frame:
+        """`frame`, which came from `peer`, with the addresses that its packet left out."""
+        source, destination = frame.source, frame.destination
+        if source == NOBODY:
+            source = self.far(peer)
+        if destination == NOBODY:
+            destination = self.own
+        elif destination.is_numbered:
+            destination = Address.numbered(destination.number, self.domain)
+        return frame._replace(source=source, destination=destination)
 
     def far(self, peer: Peer) -> Address:
         """Who is at the far end `peer`; named after the link where the configuration does not say."""

@@ -11,8 +11,9 @@ from typing import Final, NamedTuple
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import Address, Frame
+from psiu_broker.protocols import PROTOCOLS
 
-VERSION: Final = 1
+VERSION: Final = 2
 LONGEST: Final = 65_535
 
 _HEADER: Final = struct.Struct(">BQQQQIhhH")
@@ -43,7 +44,7 @@ def pack(envelope: Envelope) -> bytes:
     """
     frame = envelope.frame
     source, destination = frame.source, frame.destination
-    texts = (frame.protocol, source.name, source.domain, destination.name, destination.domain)
+    texts = (frame.protocol, source.name, source.domain, destination.name, destination.domain, frame.subject)
     if any(_MARK in text for text in texts):
         raise EncodeError("a name with a NUL in it cannot be sent to another broker")
     words = _MARK.join(texts).encode("utf-8", "surrogatepass")
@@ -73,13 +74,19 @@ def unpack(data: bytes) -> Envelope | None:
     _, epoch, to_epoch, sequence, sent_us, age_ms, source, destination, length = _HEADER.unpack_from(data)
     start = _HEADER.size + length
     try:
-        protocol, source_name, source_domain, name, domain = data[_HEADER.size : start].decode("utf-8").split(_MARK)
-        make = _MAKERS[protocol]
-    except (ValueError, KeyError):
+        texts = data[_HEADER.size : start].decode("utf-8").split(_MARK)
+        protocol, source_name, source_domain, name, domain, subject = texts
+    except ValueError:
         return None
     if len(data) < start or not (_is_address(source_name, source) and _is_address(name, destination)):
         return None
-    frame = make(Address(source_name, source, source_domain), Address(name, destination, domain), data[start:])
+    sender, receiver = Address(source_name, source, source_domain), Address(name, destination, domain)
+    if protocol not in PROTOCOLS:
+        return None
+    make = _MAKERS.get(protocol)
+    frame = Frame(sender, receiver, subject, data[start:], protocol) if make is None else None
+    if make is not None:
+        frame = make(sender, receiver, data[start:])
     return None if frame is None else Envelope(epoch, to_epoch, sequence, sent_us, age_ms, frame)
 
 

@@ -75,6 +75,7 @@ class Router:
         heard: called when a robot is heard for the first time or from a new way.
         withdrawn: called when the route to a robot is given up.
         ownership: who owns the robots that other brokers hear too; None where there are no others.
+        plays: the links on which programs are told that the broker is some robot, whatever that speaks.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class Router:
         withdrawn: Callable[[Route], None] = lambda _: None,
         duplicates: Duplicates | None = None,
         ownership: Ownership | None = None,
+        plays: Collection[str] = (),
     ) -> None:
         self.table = Table(bindings, withdrawn)
         self._routes = self.table.routes
@@ -96,6 +98,7 @@ class Router:
         self.ports: dict[str, Port] = {}
         """The links that are up, and `MESH`."""
         self._ownership = ownership
+        self._plays = frozenset(plays)
         self._identity = identity
         self._heard = heard
         self._duplicates = duplicates or Duplicates()
@@ -132,7 +135,7 @@ class Router:
             return Decision("ask", hops) if hops else Decision("drop", verdict=NO_ROUTE)
         if target.way == SELF:
             return _ANSWER if arrived != SELF else Decision("drop", verdict=SAME_WAY)
-        translatable = (protocol, target.protocol) == ("psiu-ascii", "psiu-hexa") and target.way.link != MESH
+        translatable = self._is_translatable(protocol, target, arrived)
         if target.way.link not in self.ports:
             return Decision("translate" if translatable else "drop", verdict=LINK_DOWN)
         if target.way.link == MESH:
@@ -260,6 +263,11 @@ class Router:
             elif source.way.link == MESH and self._ownership is not None and source.may_be_on(arrived):
                 self._ownership.overhear(source, frame, arrived, now)
         return DOUBLE
+
+    def _is_translatable(self, protocol: str, target: Route, arrived: Way) -> bool:
+        """Whether the broker asks `target` in the sender's stead: its protocol is another one, and words tell which."""
+        asked = protocol == "psiu-ascii" or arrived.link in self._plays
+        return asked and target.protocol != protocol and target.way.link != MESH
 
     def _decide_by_mesh(self, target: Route, arrived: Way) -> Decision:
         """For a robot of another broker: to that broker, never from one to the next."""
