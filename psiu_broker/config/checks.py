@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterable, Mapping
 from ipaddress import ip_address
 from typing import Final
 
-from psiu_broker.adapter import Adapter
+from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
-from psiu_broker.config.problems import Key, Problems, got
+from psiu_broker.config.problems import Key, Problems, got, suggestion
 from psiu_broker.config.tables import (
     ENDPOINT,
     BrokerConfiguration,
@@ -19,6 +19,7 @@ from psiu_broker.config.tables import (
 )
 from psiu_broker.frame import Address
 from psiu_broker.profiles.hexa import RESERVED, Node
+from psiu_broker.protocols import PROTOCOLS
 
 _WORD: Final = re.compile(r"[!-~]+")
 _NUMBERED_TTY: Final = re.compile(r"/dev/tty(USB|ACM)[0-9]+")
@@ -128,6 +129,46 @@ def check_identities(
                 f"{robot.address} is the address of {first} already;"
                 " give it another address, or its link a domain of its own",
             )
+
+
+def check_ends(
+    links: Mapping[str, LinkConfiguration], robots: Mapping[str, RobotConfiguration], problems: Problems
+) -> None:
+    """Where packets name nobody, each far end is one robot; or a program, and then it is told of one that there is."""
+    there: dict[tuple[str, Peer], str] = {}
+    for robot in robots.values():
+        link, protocol = links[robot.link], PROTOCOLS[robot.protocol]
+        if protocol.codec.addressed:
+            continue
+        if link.options.plays is not None:
+            text = f"programs are at the far end of {link.name}, which plays {link.options.plays}; choose another link"
+            problems.add(("robots", robot.name, "link"), text)
+        elif robot.address is None and (first := there.setdefault((link.name, robot.peer), robot.name)) != robot.name:
+            where = "its peer" if link.adapter.many_peers else "a link of its own"
+            text = f"{first} is there already, and {robot.protocol} names no robot; give {robot.name} {where}"
+            problems.add(("robots", robot.name, "link"), text)
+    for link in links.values():
+        if link.options.plays is not None:
+            _check_played(link, link.options.plays, robots, problems)
+
+
+def _check_played(
+    link: LinkConfiguration, plays: str, robots: Mapping[str, RobotConfiguration], problems: Problems
+) -> None:
+    key = ("links", link.name, "plays")
+    protocol = PROTOCOLS[link.protocol]
+    if protocol.codec.addressed:
+        problems.add(key, f"is not for {link.protocol}, whose programs name the robots themselves; remove it")
+    elif plays not in robots:
+        known = suggestion(plays, robots) if robots else "add [robots.NAME]"
+        problems.add(key, f"there is no robot {got(plays)} in this file; {known}")
+    elif robots[plays].protocol == link.protocol:
+        if link.map is not None:
+            problems.add(("links", link.name, "map"), f"{plays} speaks {link.protocol} itself; remove it")
+    elif protocol.persona is None:
+        choices = ", ".join(sorted(name for name, each in PROTOCOLS.items() if each.persona is not None))
+        text = f"{plays} speaks {robots[plays].protocol}, and cannot be played in {link.protocol}; use one of {choices}"
+        problems.add(key, text)
 
 
 def warnings_about(file: str, zenoh: ZenohConfiguration, links: Iterable[LinkConfiguration]) -> tuple[str, ...]:

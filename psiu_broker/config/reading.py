@@ -14,6 +14,7 @@ from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.checks import (
     check_devices,
+    check_ends,
     check_far_end,
     check_identities,
     check_nodes,
@@ -105,6 +106,8 @@ def _configuration(document: dict[str, Any], file: str, problems: Problems) -> C
     whole_links = {name: link for name, link in links.items() if link}
     whole_robots = {name: robot for name, robot in robots.items() if robot}
     check_devices(whole_links.values(), trunks.values(), problems)
+    if None not in links.values():
+        check_ends(whole_links, whole_robots, problems)
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
     if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
