@@ -102,6 +102,7 @@ class Broker:
         self.report = Report(name, self.exchange, self.resident.commands, self._trunks)
         for link in configuration.links.values():
             self.exchange.add(self._link(link))
+        self._directories.add((Address.named(name),))
         for route in router.robots():
             self._directories.add(route.addresses)
         self._last_alive = LastAlive(name) if configuration.mesh.mode == "router" else None

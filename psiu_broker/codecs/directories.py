@@ -24,7 +24,9 @@ class Directories:
             directory = self.of(address.domain)
             if address.is_numbered:
                 directory.numbers.add(address.number)
-            elif " " in address.name:
+                continue
+            directory.all_names.add(address.name)
+            if " " in address.name:
                 directory.names.add(address.name)
 
     def remove(self, addresses: Iterable[Address]) -> None:
@@ -32,4 +34,5 @@ class Directories:
         for address in addresses:
             directory = self.of(address.domain)
             directory.names.discard(address.name)
+            directory.all_names.discard(address.name)
             directory.numbers.discard(address.number)
