@@ -5,7 +5,7 @@ Versions. 2012 is the document; the firmware of 2013 renamed letters so that non
 both ``drive``, so that a frame of one version goes to a robot of another under the letter that this one knows.
 
 How it is read. Messages follow each other without a mark. While the reader is *in step*, each begins where the last
-one ended. Anything else there loses the step, and what restores it is a letter that is no hexadecimal digit with four
+one ended. Anything else there loses the step, and what restores it is a known letter that is no digit with four
 digits behind it, the end of a line, of a datagram, or a silence; before these, messages are counted off backwards,
 since D, E, F and f of 2012 look like digits.
 
@@ -60,6 +60,8 @@ SCRIPT: Final = "script/"
 """Before the word of a message that is recorded, not done: ``script/nod``. Such messages are sent exactly once."""
 LETTER: Final = "letter/"
 """Before a letter that the version has no word for: ``letter/Q``."""
+STOP: Final = "stop"
+"""The subject of a frame of ours that stops both motors: a ``drive`` of 0 that overtakes what waits."""
 REALIGN: Final = "realign"
 """The subject of a frame of ours whose payload is sent as it is, to find the step of a 2012 body."""
 
@@ -134,8 +136,9 @@ class Mitya(Codec):
         self.silence_s = self.options.silence_ms / 1000
         self._heard_dialect = f"{self.dialect}/heard"
         self._repeat = self.options.repeat or (3 if datagrams else 1)
-        known = frozenset(ord(letter) for letter in LETTERS[self.version])
-        self._letters = known | _LATIN if self.version == "2012" else (known | _LATIN) - _DIGITS
+        self._known = frozenset(ord(letter) for letter in LETTERS[self.version])
+        self._letters = self._known | (_LATIN if self.version == "2012" else _LATIN - _DIGITS)
+        self._sure = self._known - _DIGITS
         self._begun = b""
         self._lost = False
         self._noise = Noise()
@@ -191,6 +194,8 @@ class Mitya(Codec):
     def _letter(self, word: str, payload: bytes) -> str:
         if word == DONE and self.version != "2012":
             return "#"
+        if word == STOP:
+            return BY_WORD[self.version]["drive"]
         if word.startswith(LETTER):
             if payload[0] in self._letters:
                 return chr(payload[0])
@@ -200,7 +205,6 @@ class Mitya(Codec):
 
     def _read(self, buffer: bytes, events: list[Event], now: float) -> None:
         """Read to the end of `buffer`, or to where a message may have begun."""
-        letters = self._letters
         at = start = 0
         # Between `start` and `at` are digits that, while lost, may be messages counted off from where they end.
         while at < len(buffer):
@@ -211,7 +215,7 @@ class Mitya(Codec):
                 self._lost = False
                 at = start = at + 1
                 continue
-            if byte in letters and not (self._lost and byte in _DIGITS):
+            if byte in (self._sure if self._lost else self._letters):
                 candidate = buffer[at : at + MESSAGE_BYTES]
                 if all(digit in _DIGITS for digit in candidate[1:]):
                     if len(candidate) < MESSAGE_BYTES:
@@ -233,7 +237,7 @@ class Mitya(Codec):
     def _counted_off(self, digits: bytes, events: list[Event], now: float) -> bytes:
         """Take the messages that end where `digits` end; what is before them."""
         start = len(digits)
-        while start >= MESSAGE_BYTES and digits[start - MESSAGE_BYTES] in self._letters:
+        while start >= MESSAGE_BYTES and digits[start - MESSAGE_BYTES] in self._known:
             start -= MESSAGE_BYTES
         if start < len(digits):
             self._noise.add(digits[:start], events)
