@@ -6,7 +6,13 @@ from collections.abc import Callable
 import pytest
 from mesh.simulated import RADIO, WIFI, Simulation, Station, wire
 
-from psiu_broker.frame import MESH, Address, Way
+from psiu_broker.codecs import psiu_ascii
+from psiu_broker.frame import MESH, Address, Frame, Way
+from psiu_broker.mesh.beat import Beat
+from psiu_broker.mesh.mesh import ASKED_S, FORMER_MAX
+from psiu_broker.mesh.neighbour import ALIVE_S
+from psiu_broker.routing.claims import Claim
+from psiu_broker.routing.router import SELF
 from psiu_broker.routing.table import Binding
 
 MNERIM = Address.named("MNERIM")
@@ -95,6 +101,43 @@ def test_a_frame_that_waited_in_a_stopped_broker_moves_no_robot_later(mesh: Simu
     assert mesh.transmitted(command) == 0
     assert mesh.stations["A"].exchange.accounts[MESH].fates["expired"] == 1
     mesh.balances()
+
+
+@pytest.fixture
+def ages(mesh: Simulation) -> list[float]:
+    """How old the frames were said to be that came to B."""
+    ages: list[float] = []
+    relayed = mesh.stations["B"].relayed
+
+    def note(frame: Frame, way: Way, now: float, age_s: float) -> object:
+        ages.append(age_s)
+        return relayed(frame, way, now, age_s)
+
+    mesh.stations["B"].relayed = note  # type: ignore[method-assign]
+    return ages
+
+
+def test_a_frame_that_waited_until_its_robot_was_found_is_said_to_be_so_old(
+    mesh: Simulation, ages: list[float]
+) -> None:
+    command = mesh.says("PC", "C", "OUTRO", "parafrente", "1", link=WIFI)
+    mesh.run(0.4)
+    ages.clear()
+    mesh.says("OUTRO", "B", "C", "oi")
+    mesh.run(0.1)
+    assert mesh.transmitted(command) == 1
+    assert ages == [pytest.approx(0.4, abs=0.05)]
+
+
+@pytest.mark.parametrize(("patience_s", "age_s"), [(0.5, 1.5), (2.0, 0.0), (10.0, 0.0), (float("inf"), 0.0)])
+def test_another_broker_waits_no_longer_than_who_sends_would(
+    mesh: Simulation, ages: list[float], patience_s: float, age_s: float
+) -> None:
+    station = mesh.stations["A"]
+    frame = psiu_ascii.message(Address.named("A"), MNERIM, "parafrente", "1")
+    assert station.mesh.offer(frame, "B", SELF, station.now, patience_s) == "delivered"
+    mesh.run(0.1)
+    assert ages == [pytest.approx(age_s, abs=0.01)]
 
 
 def test_frames_and_tokens_are_few_where_nothing_happens(mesh: Simulation) -> None:
@@ -417,7 +460,95 @@ def test_a_link_that_fails_withdraws_its_robots_everywhere(mesh: Simulation) -> 
     assert mesh.owner("MNERIM") == "A"
 
 
+def test_a_computer_that_slept_holds_nobody_for_silent(mesh: Simulation) -> None:
+    """All brokers sleep; nobody was there to notice."""
+    for name in mesh.stations:
+        mesh.stop(name)
+    for station in mesh.stations.values():
+        station.waiting.clear()
+    mesh.run(60)
+    for name in mesh.stations:
+        mesh.resume(name)
+    mesh.run(10)
+    assert mesh.declared_anew == 0
+    assert mesh.owner("MNERIM") == "A"
+
+
+# The lives of a broker: Zenoh may tell of a new one before the old one is gone.
+
+
+@pytest.fixture
+def alone() -> Station:
+    return Simulation("Z").stations["Z"]
+
+
+def life_of_a(station: Station) -> int | None:
+    neighbour = station.neighbours.find("A")
+    return None if neighbour is None else neighbour.epoch
+
+
+def beat_of_a(station: Station, epoch: int) -> None:
+    station.mesh.beat_came(Beat(broker="A", epoch=epoch, sent_us=0), station.now)
+
+
+def test_a_broker_that_lives_is_not_displaced_by_an_announcement_alone(alone: Station) -> None:
+    alone.mesh.broker_came("A", 5, "old", "0", alone.now)
+    alone.mesh.broker_came("A", 6, "new", "0", alone.now)
+    assert life_of_a(alone) == 5
+    beat_of_a(alone, 6)
+    assert life_of_a(alone) == 6
+
+
+def test_a_broker_that_fell_silent_is_displaced_by_its_next_announcement_and_not_by_an_older_one(
+    alone: Station,
+) -> None:
+    alone.mesh.broker_came("A", 5, "old", "0", alone.now)
+    later = alone.now + ALIVE_S + 0.1
+    alone.mesh.broker_came("A", 4, "older", "0", later)
+    assert life_of_a(alone) == 5
+    alone.mesh.broker_came("A", 6, "new", "0", later)
+    assert life_of_a(alone) == 6
+
+
+def test_when_one_life_goes_the_next_is_there_at_once(alone: Station) -> None:
+    alone.mesh.broker_came("A", 5, "old", "0", alone.now)
+    alone.mesh.broker_came("A", 6, "new", "0", alone.now)
+    alone.mesh.broker_went("A", 5, "0", alone.now)
+    assert life_of_a(alone) == 6
+    alone.mesh.broker_went("A", 6, "0", alone.now)
+    assert life_of_a(alone) is None
+
+
+def test_what_a_former_life_claimed_is_not_the_new_one_s(alone: Station) -> None:
+    alone.mesh.broker_came("A", 5, "old", "0", alone.now)
+    alone.mesh.claimed("A", 5, Claim(MNERIM, None, "psiu-ascii", RADIO, 1, 10, 0), alone.now)
+    alone.mesh.broker_came("A", 6, "new", "0", alone.now)
+    assert alone.owner("MNERIM") == "A"
+    beat_of_a(alone, 6)
+    assert alone.owner("MNERIM") is None
+    assert alone.route("MNERIM") is None
+
+
+def test_memory_of_those_who_went_is_bounded(alone: Station) -> None:
+    for epoch in range(FORMER_MAX + 50):
+        alone.mesh.broker_came("A", epoch, "id", "0", alone.now)
+        alone.mesh.broker_went("A", epoch, "0", alone.now)
+    assert len(alone.mesh._former) == FORMER_MAX
+
+
 # Lost messages.
+
+
+def test_a_broker_that_does_not_answer_is_asked_seldom_what_it_claims() -> None:
+    mesh = Simulation("Z")
+    station = mesh.stations["Z"]
+    station.mesh.broker_came("A", 5, "id", "0", station.now)
+    begun = mesh.now
+    while mesh.now - begun < 7 * ASKED_S:
+        told = Beat(broker="A", epoch=5, sent_us=int(mesh.now * 1e6), heard={"Z": (0, 0)}, claims="of others")
+        station.mesh.beat_came(told, station.now)
+        mesh.run(0.4)
+    assert 4 <= mesh.sent["notice"] <= 7
 
 
 @pytest.mark.parametrize("kind", ["token", "untoken", "beat", "notice", "any"])
