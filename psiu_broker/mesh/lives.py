@@ -4,7 +4,10 @@ from collections.abc import Iterator
 from typing import Final
 
 BROKERS_MAX: Final = 1024
+LIVES_MAX: Final = 16
+"""Of one broker."""
 EDITIONS_MAX: Final = 16
+"""Of one life."""
 NAMESAKE_S: Final = 3.0
 """A broker of our name that is announced for longer than this is no former life of ours."""
 NAMESAKES_MAX: Final = 64
@@ -31,7 +34,10 @@ class Lives:
         """Note an announcement; False where there are too many."""
         if name not in self._announced and len(self._announced) >= BROKERS_MAX:
             return False
-        life = self._announced.setdefault(name, {}).setdefault(epoch, _Life(zenoh_id))
+        lives = self._announced.setdefault(name, {})
+        if epoch not in lives and len(lives) >= LIVES_MAX:
+            return False
+        life = lives.setdefault(epoch, _Life(zenoh_id))
         if len(life.editions) < EDITIONS_MAX:
             life.editions.add(edition)
         return True
@@ -82,7 +88,9 @@ class Namesakes:
 
     def came(self, epoch: int, edition: str, now: float) -> None:
         if epoch in self._known or len(self._known) < NAMESAKES_MAX:
-            self._known.setdefault(epoch, _Namesake(now)).editions.add(edition)
+            namesake = self._known.setdefault(epoch, _Namesake(now))
+            if len(namesake.editions) < EDITIONS_MAX:
+                namesake.editions.add(edition)
 
     def went(self, epoch: int, edition: str) -> None:
         namesake = self._known.get(epoch)

@@ -136,7 +136,10 @@ class Mesh:
     def offer(
         self, frame: Frame, peer: object, arrived: Way, now: float, patience_s: float = inf, fate: Fate | None = None
     ) -> Verdict | None:
-        """Hand `frame` to the broker `peer`; like `Link.offer`, but nothing ever waits."""
+        """Hand `frame` to the broker `peer`; like `Link.offer`, but nothing ever waits.
+
+        The other broker is told an age, not a patience: one that leaves no more than `patience_s` of `MAX_AGE_S`.
+        """
         neighbour = self.neighbours.find(str(peer))
         if neighbour is None:
             return LINK_DOWN

@@ -1,6 +1,6 @@
 """Which brokers are announced, and who else has our name."""
 
-from psiu_broker.mesh.lives import BROKERS_MAX, NAMESAKE_S, NAMESAKES_MAX, Lives, Namesakes
+from psiu_broker.mesh.lives import BROKERS_MAX, EDITIONS_MAX, LIVES_MAX, NAMESAKE_S, NAMESAKES_MAX, Lives, Namesakes
 
 
 def test_a_life_is_over_with_its_last_announcement() -> None:
@@ -32,6 +32,25 @@ def test_no_more_brokers_are_known_than_can_be_and_those_that_are_stay() -> None
     assert lives.came("B0", 2, "id", "0")
     lives.went("B1", 1, "0")
     assert lives.came("one more", 1, "id", "0")
+
+
+def test_one_broker_has_no_more_lives_than_can_be_and_the_ones_that_are_known_stay() -> None:
+    lives = Lives()
+    assert [lives.came("B", epoch, "id", "0") for epoch in range(LIVES_MAX + 1)] == [True] * LIVES_MAX + [False]
+    assert lives.came("B", 0, "id", "1")
+    lives.went("B", 1, "0")
+    assert lives.came("B", LIVES_MAX, "id", "0")
+
+
+def test_announcements_without_end_are_not_remembered() -> None:
+    lives, namesakes = Lives(), Namesakes()
+    for edition in range(EDITIONS_MAX + 50):
+        lives.came("B", 1, "id", str(edition))
+        namesakes.came(1, str(edition), 0.0)
+    assert [lives.went("B", 1, str(edition)) for edition in range(EDITIONS_MAX)][-1], "the rest was never noted"
+    for edition in range(EDITIONS_MAX):
+        namesakes.went(1, str(edition))
+    assert list(namesakes.since(100.0)) == []
 
 
 def test_a_broker_of_our_name_is_a_namesake_when_it_stays() -> None:
