@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from psiu_broker.codecs.codec import Codec
+from psiu_broker.codecs.mitya import Mitya
 from psiu_broker.codecs.psiu_ascii import PsiuAscii
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.profiles.hexa import HexaProfile
+from psiu_broker.profiles.mitya import MityaProfile
+from psiu_broker.profiles.mitya_persona import MityaPersona
 from psiu_broker.profiles.persona import Persona
 from psiu_broker.profiles.profile import Profile
 from psiu_broker.profiles.psiu import PsiuProfile
@@ -29,6 +32,7 @@ class Protocol:
 PROTOCOLS: Final[Mapping[str, Protocol]] = {
     "psiu-ascii": Protocol(PsiuAscii, PsiuProfile),
     "psiu-hexa": Protocol(PsiuHexa, HexaProfile, numbers=lambda _: range(256)),
+    "mitya": Protocol(Mitya, MityaProfile, MityaPersona),
 }
 """Every protocol by the name that the user writes as ``protocol``."""
 

@@ -1,0 +1,184 @@
+"""A whole broker and robots of every protocol: called, listed, published, commanding each other."""
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+from ports import free_port
+
+from psiu_broker.broker import Broker
+from psiu_broker.codecs import psiu_ascii
+from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.psiu_ascii import PsiuAscii
+from psiu_broker.config import load
+from psiu_broker.errors import CallError
+from psiu_broker.frame import Address
+from psiu_broker.messages import Answer, CallRequest, Card
+from psiu_broker.simulator import AsciiRobot, PtyPort
+from psiu_broker.simulator.mitya import MityaBody
+
+CODEC = PsiuAscii(PsiuAscii.Options(), Directory())
+
+
+async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
+    """The broker's state is values, not events: look until it is so."""
+    async with asyncio.timeout(timeout_s):
+        while not true():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+class Lab:
+    """A broker with the configuration `text`, which has no head: that is the same for all."""
+
+    def __init__(self, folder: Path, text: str) -> None:
+        self.bus = free_port()
+        file = folder / "lab.toml"
+        file.write_text(f'[broker]\nname = "base"\n[zenoh]\nlisten = ["tcp/127.0.0.1:{self.bus}"]\n{text}')
+        self.broker = Broker(load(file))
+
+    async def call(self, robot: str, command: str, *parameters: int | float | str) -> Answer | None:
+        return await self.broker.call(Address.parse(robot), command, CallRequest(parameters=list(parameters)))
+
+    def card(self, robot: str) -> Card:
+        card = self.broker.card(Address.parse(robot))
+        assert card is not None
+        return card
+
+    @asynccontextmanager
+    async def listening(self, key: str) -> AsyncIterator[list[dict[str, object]]]:
+        """What is put under `key` from now on."""
+        heard: list[dict[str, object]] = []
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{self.bus}"]')
+        session = await asyncio.to_thread(zenoh.open, config)
+        loop = asyncio.get_running_loop()
+
+        def take(sample: zenoh.Sample) -> None:
+            loop.call_soon_threadsafe(
+                heard.append, json.loads(sample.payload.to_bytes()) | {"key": str(sample.key_expr)}
+            )
+
+        subscriber = await asyncio.to_thread(session.declare_subscriber, key, take)
+        try:
+            await until(lambda: self.broker.exchange.bus.listened)
+            yield heard
+        finally:
+            await asyncio.to_thread(subscriber.undeclare)
+            await asyncio.to_thread(session.close)
+
+
+@asynccontextmanager
+async def lab(folder: Path, text: str, *ports: PtyPort) -> AsyncIterator[Lab]:
+    made = Lab(folder, text)
+    for port in ports:
+        await port.open()
+    await made.broker.start()
+    try:
+        await until(lambda: all(link.state == "open" for link in made.broker.links()))
+        yield made
+        ledger = made.broker.ledger()
+        assert ledger.balances, ledger
+    finally:
+        await made.broker.stop()
+        for port in ports:
+            await port.close()
+
+
+def message(destination: str, words: str, source: str) -> bytes:
+    return CODEC.encode(psiu_ascii.message(Address.named(source), Address.named(destination), *words.split()))
+
+
+def link(name: str, device: Path | str, protocol: str, more: str = "") -> str:
+    return f"""
+[links.{name}]
+adapter = "serial"
+device = "{device}"
+baudrate = 115200
+protocol = "{protocol}"
+{more}
+"""
+
+
+async def test_a_mitya_is_called_by_letter_or_by_name_and_lists_its_commands(tmp_path: Path) -> None:
+    body = MityaBody("MITYA", version="2013")
+    port = PtyPort(body, link=tmp_path / "corpo")
+    text = link("corpo", port.path, "mitya", 'version = "2013"') + '[robots.MITYA]\nlink = "corpo"\n'
+    async with lab(tmp_path, text, port) as made, made.listening("psiu/MITYA/**") as heard:
+        answer = await made.call("MITYA", "G", 100)
+        assert answer is not None
+        assert answer.status == "sucesso"
+        assert body.body.left == body.body.right == 100
+        await made.call("MITYA", "drive", -100)
+        assert body.body.left == -100
+        with pytest.raises(CallError, match="-255"):
+            await made.call("MITYA", "drive", 99999)
+        names = [command.name for command in made.card("MITYA").commands]
+        assert "drive" in names
+        counted = await made.call("MITYA", "quantoscomandos")
+        assert counted is not None
+        assert counted.values == [len(names)]
+        shown = await made.call("MITYA", "exibecomando", 1)
+        assert shown is not None
+        assert shown.values[0] == names[0]
+        await until(lambda: heard)
+        assert heard[0]["protocol"] == "mitya"
+
+
+async def test_a_program_in_words_moves_a_mitya(tmp_path: Path) -> None:
+    body, pc = MityaBody("MITYA", version="2013"), AsciiRobot("PC")
+    said: list[bytes] = []
+    corpo = PtyPort(body, link=tmp_path / "corpo")
+    radio = PtyPort(pc, link=tmp_path / "radio", observer=lambda way, data: said.append(data) if way == "in" else None)
+    text = (
+        link("corpo", corpo.path, "mitya", 'version = "2013"')
+        + link("radio", radio.path, "psiu-ascii")
+        + '[robots.MITYA]\nlink = "corpo"\n'
+    )
+    async with lab(tmp_path, text, corpo, radio) as made:
+        radio.send(message("MITYA", "drive 100", "PC"))
+        await until(lambda: body.body.left == 100)
+        await until(lambda: any(b"drive sucesso MITYA" in each for each in said))
+        radio.send(message("MITYA", "quantoscomandos", "PC"))
+        count = len(made.card("MITYA").commands)
+        await until(lambda: any(b"quantoscomandos %d MITYA" % count in each for each in said))
+        radio.send(message("MITYA", "drive 99999", "PC"))
+        await until(lambda: any(b"drive falha MITYA" in each for each in said))
+
+
+async def test_a_mitya_program_over_udp_drives_a_robot_of_words(tmp_path: Path) -> None:
+    robot = AsciiRobot("MNERIM", per_unit_s=0.0)
+    radio, port = PtyPort(robot, link=tmp_path / "radio"), free_port(socket.SOCK_DGRAM)
+    text = (
+        link("radio", radio.path, "psiu-ascii")
+        + f"""
+[links.painel]
+adapter = "udp"
+listen = "127.0.0.1:{port}"
+protocol = "mitya"
+plays = "MNERIM"
+map.D = {{ command = "parafrente", below_zero = "paratras", scale = 1 }}
+map.R = {{ command = "giradireita", scale = 1 }}
+[robots.MNERIM]
+link = "radio"
+"""
+    )
+    async with lab(tmp_path, text, radio) as made:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+            program.connect(("127.0.0.1", port))
+            program.setblocking(False)
+            program.send(b"D0064\r\n")
+            await until(lambda: robot.position.x == 100)
+            program.send(b"DFFCE")
+            await until(lambda: robot.position.x == 50)
+            program.send(b"R005A")
+            await until(lambda: robot.position.heading != 0)
+            program.send(b"Q0001")
+            complaint = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(program, 100), 2.0)
+            assert complaint == b"E0102"
+        assert made.broker.ledger().total.arrived > 0
