@@ -6,10 +6,12 @@ A call goes through these states, and every wait ends at its deadline:
                         │           │ ├──AGAIN──> settled ──> offered (bounded by `retries`)
                         │           │ ├──BUSY───> AVAIL? every `busy_poll_s` ──FREE──> offered
                         │           │ └──silence> offered again if it is a question, else outcome_unknown
+                        │           │ └──or that silence is the answer, where the protocol has no other
                         └───────────┴──dropped, not possible, link down, shutting down: CallError
 
 Offered: it may wait in the outbox of its link, and nothing that is heard can be about it.
 Quiet: the robot owes no late reply that could be mistaken for the answer. A stop waits for neither turn nor quiet.
+A procedure holds its robot's turn until it is over. It is cut short by a stop, which first waits until it has ended.
 All methods run on the event loop's thread; times are seconds of the loop's clock.
 """
 
@@ -18,16 +20,20 @@ from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
 from math import inf
-from typing import Protocol
+from typing import Final, Protocol
 
 from psiu_broker.conversation.complaints import Complaints, Traffic
 from psiu_broker.conversation.late_replies import LateReplies
+from psiu_broker.conversation.procedures import Procedures
 from psiu_broker.conversation.turns import Turns
 from psiu_broker.conversation.under_way import Offer, Robot, UnderWay
 from psiu_broker.errors import CallError, EncodeError
 from psiu_broker.frame import Address, Frame, peer_text
 from psiu_broker.messages import Answer, Value
 from psiu_broker.profiles.profile import Notice, Reading, Reply, Request
+
+MENDED_S: Final = 30.0
+"""How long a robot that was cut off in a procedure may be at other calls, each of which mends it as well."""
 
 
 class Links(Protocol):
@@ -59,6 +65,7 @@ class Conversations:
         self._under_way: dict[Address, list[UnderWay]] = {}
         self._late = LateReplies()
         self._complaints = Complaints()
+        self._procedures = Procedures(self)
         self._closed = False
 
     async def call(
@@ -76,6 +83,7 @@ class Conversations:
 
         Without `timeout_s` the deadline is as long as all tries take. A command that has not left within
         `fresh_s` is not sent; one that is to be fresh and waits for its turn gives way to a newer one like it.
+        A procedure is not begun where it could not be ended in time.
 
         Raises:
             CallError: there is no answer; its code says why.
@@ -83,17 +91,30 @@ class Conversations:
         request = robot.profile.request(command, parameters)
         retries = self._retries if retries is None else retries
         tries = 1 + retries
+        takes_s = 0.0 if request.procedure is None else request.procedure.takes_s
         if timeout_s is None:
-            timeout_s, patience_s = request.timeout_s * tries, request.timeout_s
+            timeout_s, patience_s = takes_s + request.timeout_s * tries, request.timeout_s
         else:
             patience_s = max(request.timeout_s, timeout_s / tries) if request.question else timeout_s
+        if request.procedure is not None and takes_s > timeout_s:
+            raise CallError("refused", f"{command} takes {takes_s:.1f} s, more than the {timeout_s:.3g} s it was given")
         call = _under_way(robot, command, request, timeout_s, fresh_s)
+        call.leave_by -= takes_s
         call.patience_s, call.retries, call.busy_poll_s = patience_s, retries, busy_poll_s or self._busy_poll_s
         async with self._turn(call, replaceable=fresh_s < inf and not request.question):
             await self._quiet(call)
-            reply, at = await self._ask(call)
+            if request.procedure is not None:
+                reply, at = await self._procedures.perform(call, request.procedure)
+            else:
+                reply, at = await self._ask(call)
         elapsed_ms = round((at - call.begun) * 1000, 3)
-        return Answer(status=reply.status, values=list(reply.values), unit=reply.unit, elapsed_ms=elapsed_ms)
+        return Answer(
+            status=reply.status,
+            values=list(reply.values),
+            unit=reply.unit,
+            remark=reply.remark,
+            elapsed_ms=elapsed_ms,
+        )
 
     async def tell(self, robot: Robot, command: str, parameters: Sequence[Value], *, fresh_s: float) -> None:
         """Send a command and go on: what the robot answers is nobody's.
@@ -106,9 +127,29 @@ class Conversations:
             CallError: it was not sent; its code says why.
         """
         request = robot.profile.request(command, parameters)
+        if request.procedure is not None:
+            raise CallError("bad_request", f"{command} is many messages: call it, and wait for the answer")
         call = _under_way(robot, command, request, fresh_s, fresh_s)
         async with self._turn(call, replaceable=True):
-            self._offer(call, request, call.leave_by)
+            self.offer(call, request, call.leave_by)
+
+    def occupied(self, address: Address) -> str | None:
+        """What the robot is at, during which it must hear nothing from anybody else; None: it may be told anything."""
+        return self._procedures.command(address)
+
+    def cut(self, link: str) -> list[Robot]:
+        """The robots on `link` that are in the middle of a procedure that was cut short: `mend` them first of all."""
+        return self._procedures.cut(link)
+
+    async def mend(self, robot: Robot) -> None:
+        """Bring a robot out of the procedure that was cut short, if one was; the next call to it would, too.
+
+        Raises:
+            CallError: it had no turn.
+        """
+        now = asyncio.get_running_loop().time()
+        async with self._turns.turn(robot.address, name=robot.name, command="mend", until=now + MENDED_S):
+            await self._procedures.mend(robot)
 
     def heard(self, frame: Frame, now: float) -> bool:
         """Take a frame from a robot; True when it was an answer, to a call under way or an earlier request."""
@@ -187,22 +228,32 @@ class Conversations:
 
     @asynccontextmanager
     async def _turn(self, call: UnderWay, *, replaceable: bool) -> AsyncIterator[None]:
-        """Wait until no other call to this robot is under way, unless it is a stop."""
+        """Wait until no other call to this robot is under way, or, for a stop, until no procedure is."""
         self._refuse_when_closed()
+        robot = call.robot
+        if call.is_stop or call.is_ending:
+            await self._procedures.interrupt(robot.address, call.command, call.leave_by)
         if call.is_stop:
-            with self._hearing(call):
+            await self._procedures.mend(robot)
+            self._refuse_when_closed()
+            with self.hearing(call):
                 yield
             return
-        robot = call.robot
         async with self._turns.turn(
-            robot.address, name=robot.name, command=call.command, until=call.leave_by, replaceable=replaceable
+            robot.address,
+            name=robot.name,
+            command=call.command,
+            until=call.leave_by,
+            replaceable=replaceable,
+            alone=call.request.procedure is not None,
         ):
+            await self._procedures.mend(robot)
             self._refuse_when_closed()
-            with self._hearing(call):
+            with self.hearing(call):
                 yield
 
     @contextmanager
-    def _hearing(self, call: UnderWay) -> Iterator[None]:
+    def hearing(self, call: UnderWay) -> Iterator[None]:
         """Have the call hear its robot; the replies that are missing when it ends are owed."""
         address = call.robot.address
         self._under_way.setdefault(address, []).append(call)
@@ -213,10 +264,11 @@ class Conversations:
             if not self._under_way[address]:
                 del self._under_way[address]
             now, profile, request = asyncio.get_running_loop().time(), call.robot.profile, call.request
-            if call.frame is not None:
+            alone = request.procedure is not None  # it has waited until the robot has said all
+            if call.frame is not None and not alone:
                 missing = call.sent - call.answered
                 self._late.expect(call.frame, profile, request, missing, now, call.sent_at + request.timeout_s)
-            for offer in call.waiting:
+            for offer in call.waiting if not alone else ():
                 self._late.expect_waiting(offer.frame, profile, request, now, offer.until)
 
     async def _quiet(self, call: UnderWay) -> None:
@@ -239,7 +291,7 @@ class Conversations:
         while True:
             until = min(loop.time() + call.patience_s, call.deadline)
             asked_again = call.sent and call.request.question
-            self._offer(call, call.request, until if asked_again else min(until, call.leave_by))
+            self.offer(call, call.request, until if asked_again else min(until, call.leave_by))
             tries += 1
             reading, at = await self._after_sending(call, until)
             if reading is Notice.FREE:
@@ -248,6 +300,8 @@ class Conversations:
                 return reading, at
             elif reading is Notice.IMPOSSIBLE:
                 raise CallError("impossible", f"{call.robot.name} says that {call.command} is impossible")
+            elif reading is None and call.request.silence is not None:
+                return call.request.silence, loop.time()
             elif reading is None and not call.request.question:
                 raise _outcome_unknown(call, loop.time())
             elif tries > call.retries or loop.time() >= call.deadline:
@@ -258,8 +312,11 @@ class Conversations:
 
         The frame may leave up to `until`; the robot has as long as it may take from then on.
         """
-        await self._left(call, until)
-        until = min(max(call.sent_at + call.patience_s, until), call.deadline)
+        await self.left(call, until)
+        if call.request.silence is not None:
+            until = min(call.sent_at + call.request.timeout_s, call.deadline)
+        else:
+            until = min(max(call.sent_at + call.patience_s, until), call.deadline)
         reading, at = await self._next_but(call, until, Notice.FREE)
         if reading is Notice.AGAIN:
             settled = min(asyncio.get_running_loop().time() + self._settle_s, call.deadline)
@@ -269,7 +326,7 @@ class Conversations:
             reading, at = await self._until_free(call)
         return reading, at
 
-    async def _left(self, call: UnderWay, until: float) -> None:
+    async def left(self, call: UnderWay, until: float) -> None:
         """Wait until nothing of the call waits in an outbox any more, or something is heard, at most until `until`."""
         loop = asyncio.get_running_loop()
         while call.waiting and not call.heard and loop.time() < until:
@@ -296,7 +353,7 @@ class Conversations:
         while poll is not None and loop.time() < call.deadline:
             if loop.time() >= next_poll:
                 next_poll = loop.time() + call.busy_poll_s
-                self._offer(call, poll, min(next_poll, call.deadline))
+                self.offer(call, poll, min(next_poll, call.deadline))
             reading, at = await call.next(min(next_poll, call.deadline))
             if isinstance(reading, Reply):
                 return reading, at
@@ -307,8 +364,8 @@ class Conversations:
                 break
         raise CallError("busy", f"{call.robot.name} is busy and did not do {call.command}")
 
-    def _offer(self, call: UnderWay, request: Request, until: float) -> None:
-        """Send one frame of the call, which may leave up to `until`.
+    def offer(self, call: UnderWay, request: Request, until: float, *, needed: bool | None = None) -> None:
+        """Send one frame of the call, which may leave up to `until`. If it is `needed`, the call ends if it is dropped.
 
         Raises:
             CallError: it cannot go.
@@ -322,7 +379,7 @@ class Conversations:
             raise CallError("refused", f"{call.command} cannot be sent to {robot.name}: {error}") from error
         before = self._links.traffic(robot.link)
         call.sending = None
-        call.waiting.append(Offer(frame, until, needed=request is call.request))
+        call.waiting.append(Offer(frame, until, needed=request is call.request if needed is None else needed))
         refused = self._links.send(frame, until - now)
         if refused is not None:
             call.taken(frame)

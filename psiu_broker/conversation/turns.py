@@ -19,6 +19,8 @@ class _Lane:
 
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     users: int = 0
+    alone: str | None = None
+    """The command whose turn it is, where the robot must hear nothing else meanwhile."""
     replaceable: dict[str, asyncio.Timeout] = field(default_factory=dict)
 
 
@@ -33,14 +35,21 @@ class Turns:
 
     @asynccontextmanager
     async def turn(
-        self, robot: Address, *, name: str, command: str, until: float, replaceable: bool = False
+        self,
+        robot: Address,
+        *,
+        name: str,
+        command: str,
+        until: float,
+        replaceable: bool = False,
+        alone: bool = False,
     ) -> AsyncIterator[None]:
         """Wait until `until` (the loop's clock) for the turn at `robot`, called `name`; it ends with the body.
 
         A `replaceable` one that waits is ended by a later one with the same `command`: the newest is what counts.
 
         Raises:
-            CallError: busy, too many wait; expired, no turn came or a newer one did.
+            CallError: busy, too many wait or one that is `alone` goes on; expired, no turn came or a newer one did.
         """
         lane = self._lanes.setdefault(robot, _Lane())
         replaces = replaceable and command in lane.replaceable
@@ -50,8 +59,10 @@ class Turns:
         try:
             await _acquire(lane, name, command, until, replaceable)
             try:
+                lane.alone = command if alone else None
                 yield
             finally:
+                lane.alone = None
                 lane.lock.release()
         finally:
             lane.users -= 1
@@ -74,6 +85,10 @@ async def _acquire(lane: _Lane, name: str, command: str, until: float, replaceab
     except TimeoutError:
         if limit.when() != until:
             raise CallError("expired", f"a newer {command} came while {name} was at other calls") from None
+        if lane.alone is not None:
+            raise CallError(
+                "busy", f"{name} is at {lane.alone} and hears nothing else; {command} was not sent"
+            ) from None
         waited = f"{max(until - begun, 0):.3g} s"
         raise CallError("expired", f"{name} was at other calls for {waited}; {command} was not sent") from None
     finally:

@@ -68,6 +68,11 @@ class UnderWay:
         return is_stop(self.request.subject)
 
     @property
+    def is_ending(self) -> bool:
+        """It only gets the robot out of whatever procedure it is in."""
+        return self.request.procedure is not None and not self.request.procedure.steps
+
+    @property
     def has_reply(self) -> bool:
         return any(isinstance(reading, Reply) for reading, _ in self.heard)
 

@@ -26,12 +26,44 @@ SENT: Final = Reply(None, remark="sent; this robot does not answer")
 """What silence means where the protocol has no answers."""
 
 
+class Step(NamedTuple):
+    """One message of a procedure, `place` being where it stands in what the caller wrote: a line from 1, or 0.
+
+    `pause_s` is how long the robot may take to object before the next one is sent; `name` is for a person.
+    """
+
+    subject: str
+    payload: bytes
+    name: str
+    place: int = 0
+    pause_s: float = 0.0
+
+
+class Procedure(NamedTuple):
+    """Messages between which a robot must hear nothing else, as when it records a script.
+
+    It answers the last of them; whatever it answers earlier says that it has ended the procedure itself.
+    `ending` gets it out from wherever it is, does no harm where it is not in it, is answered, and may be sent
+    in one go; `ended` says in what state it then is. Without steps there is only the ending.
+    """
+
+    steps: tuple[Step, ...]
+    ending: tuple[Step, ...]
+    ended: str
+
+    @property
+    def takes_s(self) -> float:
+        """How long it takes if the robot does not object."""
+        return sum(step.pause_s for step in self.steps)
+
+
 class Request(NamedTuple):
     """One call in a protocol's words; with two addresses around them, `subject` and `payload` are a frame.
 
     `question` is true where asking again does no harm: anything else may have moved the robot,
     and is never repeated on silence alone. `timeout_s` is how long one try waits. `silence` is what it
-    means that nothing comes in that time; None: that there is no answer.
+    means that nothing comes in that time; None: that there is no answer. With a `procedure` its steps
+    are what is sent, and `subject` and `payload` never are.
     """
 
     subject: str
@@ -39,6 +71,7 @@ class Request(NamedTuple):
     question: bool
     timeout_s: float
     silence: Reply | None = None
+    procedure: Procedure | None = None
 
 
 class Notice(Enum):
