@@ -4,11 +4,11 @@ import itertools
 from collections.abc import Callable
 
 import pytest
-from mesh.simulated import RADIO, WIFI, Simulation, Station, wire
+from mesh.simulated import RADIO, TICK_S, WIFI, Simulation, Station, wire
 
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.frame import MESH, Address, Frame, Way
-from psiu_broker.mesh.beat import Beat
+from psiu_broker.mesh.beat import Beat, Notice
 from psiu_broker.mesh.mesh import ASKED_S, FORMER_MAX
 from psiu_broker.mesh.neighbour import ALIVE_S
 from psiu_broker.routing.claims import Claim
@@ -425,6 +425,16 @@ def test_a_new_session_begins_new_series(mesh: Simulation, broker: str) -> None:
     mesh.balances()
 
 
+def test_a_frame_for_a_former_life_moves_no_robot(mesh: Simulation) -> None:
+    mesh.delay_of["frame"] = 0.3
+    command = mesh.says("PC", "C", "MNERIM", "parafrente", "1", link=WIFI)
+    mesh.reopen("A")
+    mesh.run(1)
+    assert mesh.transmitted(command) == 0
+    assert mesh.stations["A"].exchange.accounts[MESH].fates["refused"] == 1
+    mesh.balances()
+
+
 def test_a_robot_that_moved_while_the_network_was_parted_is_where_it_is_heard(mesh: Simulation) -> None:
     mesh.partition("A", "BC")
     mesh.run(3)
@@ -536,7 +546,35 @@ def test_memory_of_those_who_went_is_bounded(alone: Station) -> None:
     assert len(alone.mesh._former) == FORMER_MAX
 
 
+def test_who_comes_hears_of_us_at_once(mesh: Simulation) -> None:
+    before = mesh.beat
+    mesh.run_until(lambda: mesh.beat is not before and mesh.beat is not None and mesh.beat.broker == "B", 1.0)
+    newest = mesh.beat
+    mesh.loses = lambda *_: True
+    station = mesh.stations["B"]
+    station.mesh.broker_came("D", 5, "id", "0", station.now)
+    began = mesh.now
+    mesh.run_until(lambda: mesh.beat is not newest and mesh.beat is not None and mesh.beat.broker == "B", 1.0)
+    assert mesh.now - began <= TICK_S + 0.02
+
+
 # Lost messages.
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda it: it.mesh.beat_came(Beat(broker="A", epoch=5, sent_us=0, unseen=["Z"]), it.now),
+        lambda it: it.mesh.notice_came(Notice(broker="A"), it.now),
+    ],
+)
+def test_everything_is_declared_anew_for_a_broker_that_asks_for_it(ask: Callable[[Station], None]) -> None:
+    mesh = Simulation("Z")
+    station = mesh.stations["Z"]
+    mesh.run(2)
+    station.mesh.broker_came("A", 5, "id", "0", station.now)
+    ask(station)
+    assert mesh.declared_anew == 1
 
 
 def test_a_broker_that_does_not_answer_is_asked_seldom_what_it_claims() -> None:

@@ -55,3 +55,11 @@ def test_a_robot_on_two_links_of_one_broker_is_claimed_once(mesh: Simulation) ->
     [claim] = mesh.stations["A"].mesh.claims.of("A").values()
     assert claim.link == WIFI
     assert mesh.owner("MNERIM") == "A"
+
+
+def test_a_broker_that_lost_its_own_session_says_of_no_robot_that_it_is_gone(mesh: Simulation) -> None:
+    mesh.partition("A", "B")
+    mesh.reopen("B")
+    mesh.run(5)
+    assert mesh.stations["B"].owner("MNERIM") is None
+    assert mesh.stations["B"].orphans == []
