@@ -28,7 +28,7 @@ from psiu_broker.codecs.paced import PacedCodec, Rest, Share
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import MALFORMED_KEPT, NOBODY, Address, Frame, Malformed
 
-__all__ = ["LIMITS", "PRESETS", "Soccer", "byte_of", "first_byte", "rate_trouble", "value_of"]
+__all__ = ["LIMITS", "PRESETS", "Soccer", "byte_of", "first_byte", "hold_trouble", "rate_trouble", "value_of"]
 
 PROTOCOL: Final = "soccer"
 
@@ -173,12 +173,10 @@ class Soccer(PacedCodec):
             return byte
 
         @model_validator(mode="after")
-        def _holds_for_a_packet(self) -> Self:
-            if self.hold_s * self.rate_hz < 1:
-                raise ValueError(
-                    f"hold_s = {self.hold_s:g} is shorter than the {1 / self.rate_hz:.3g} s from one packet to the"
-                    f" next at rate_hz = {self.rate_hz:g}; raise one of them"
-                )
+        def _holds_long_enough(self) -> Self:
+            trouble = hold_trouble(self.hold_s, self.rate_hz)
+            if trouble is not None:
+                raise ValueError(f"{trouble}; raise one of them")
             return self
 
         @property
@@ -321,6 +319,13 @@ class Soccer(PacedCodec):
     def _end_noise(self, events: list[Event]) -> None:
         self._noise.end(self._reason, events)
         self._reason = ""
+
+
+def hold_trouble(hold_s: float, rate_hz: float) -> str | None:
+    """Why set-points that hold for `hold_s` may be too old before they leave; None where all is well."""
+    if hold_s * rate_hz >= 2:
+        return None
+    return f"hold_s = {hold_s:g} is shorter than two packets take at rate_hz = {rate_hz:g}, {2 / rate_hz:.3g} s"
 
 
 def rate_trouble(options: Soccer.Options, bits_per_second: int | None) -> str | None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from psiu_broker.codecs.paced import Rest
-from psiu_broker.codecs.soccer import BYTES, LIMITS, STOP, WHEELS, Soccer, byte_of, value_of
+from psiu_broker.codecs.soccer import BYTES, LIMITS, STOP, WHEELS, Soccer, byte_of, hold_trouble, value_of
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Value
@@ -133,8 +133,8 @@ class SoccerProfile(Profile):
 
 def robot_trouble(codec: Soccer.Options, robot: SoccerProfile.Options) -> str | None:
     """What in `robot` does not fit the packets of its link, with the option that says it; None where all does."""
-    if robot.hold_s is not None and robot.hold_s * codec.rate_hz < 1:
-        return f"hold_s = {robot.hold_s:g} is shorter than the {1 / codec.rate_hz:.3g} s from one packet to the next"
+    if robot.hold_s is not None and (trouble := hold_trouble(robot.hold_s, codec.rate_hz)) is not None:
+        return trouble
     if robot.stop is not None:
         try:
             _of_text(robot.stop, codec)

@@ -169,7 +169,7 @@ def test_a_packet_of_one_s_own_is_declared_whole() -> None:
         ({"preset": "nobody"}, "'mirosot', 'f180'"),
         ({"preset": ["mirosot"]}, "'mirosot', 'f180'"),
         ({"robots": 0}, "greater than or equal to 1"),
-        ({"rate_hz": 1, "hold_s": 0.5}, "hold_s = 0.5 is shorter than the 1 s from one packet to the next"),
+        ({"rate_hz": 1, "hold_s": 0.5}, "hold_s = 0.5 is shorter than two packets take at rate_hz = 1, 2 s; raise one"),
         ({"colour": "red"}, "Extra inputs"),
     ],
 )

@@ -144,7 +144,7 @@ def test_a_robot_may_have_another_stop_and_another_patience() -> None:
     [
         ({}, {"stop": "0x00"}, "stop takes 2 bytes in hexadecimal such as 0x0303, got 0x00"),
         ({}, {"stop": "0x0000"}, "stop takes bytes whose check bits are right, got 0x00; rodas makes them"),
-        ({}, {"hold_s": 0.01}, "hold_s = 0.01 is shorter than the 0.0333 s from one packet to the next"),
+        ({}, {"hold_s": 0.01}, "hold_s = 0.01 is shorter than two packets take at rate_hz = 30, 0.0667 s"),
         (
             {},
             {"commands": {"vai": {"rodas": (99, 0)}}},
