@@ -9,6 +9,7 @@ Verdict = Literal[
     "no_route",
     "expired",
     "queue_full",
+    "superseded",
     "duplicate",
     "same_way",
     "refused",
@@ -26,6 +27,8 @@ EXPIRED: Final = "expired"
 """It waited longer than its age limit."""
 QUEUE_FULL: Final = "queue_full"
 """The outbox was full and this frame was the least urgent."""
+SUPERSEDED: Final = "superseded"
+"""A newer set-point for the same robot took its place before it was sent."""
 DUPLICATE: Final = "duplicate"
 """The same frame came by another way a moment ago."""
 SAME_WAY: Final = "same_way"
