@@ -40,6 +40,8 @@ LAST_FLAG: Final = ord("z")
 TEXT: Final = "text"
 """The subject of what a board says."""
 ALIVE: Final = "alive"
+ABORT: Final = "abort"
+"""The subject of a frame of ours, without a payload, that makes a board forget what it heard of a message."""
 FLAG: Final = "flag/"
 """Before the flag in the subject of what a phone says: ``flag/A``."""
 
@@ -156,6 +158,8 @@ class Amarino(Codec):
             return frame.wire
         if frame.protocol != PROTOCOL:
             raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
+        if frame.subject == ABORT and self._is_phone and not frame.payload:
+            return _ABORT
         trouble = self._trouble(frame)
         if trouble is not None:
             raise EncodeError(trouble)

@@ -161,6 +161,14 @@ def test_what_is_no_message_is_told_with_its_reason(role: Role, data: bytes, exp
         assert [event.payload if isinstance(event, Frame) else event.reason for event in events] == expected
 
 
+def test_an_abort_clears_what_a_board_heard_and_is_nothing_by_itself() -> None:
+    abort = Frame(NOBODY, NOBODY, "abort", b"", "amarino")
+    assert amarino("phone").encode(abort) == b"\x1b"
+    assert read(amarino("board"), b"\x1b") == []
+    with pytest.raises(EncodeError):
+        amarino("board").encode(abort)
+
+
 def test_values_are_joined_and_numbers_with_a_point_have_two_decimals() -> None:
     assert values_text([180, 2.5, "on"]) == "180;2.50;on"
     assert values_text([]) == ""
