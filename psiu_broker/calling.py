@@ -68,6 +68,7 @@ class Calling:
         self.conversations = Conversations(self)
         self._robots = {Address.named(robot.name): robot for robot in configuration.robots.values()}
         self._exchange = exchange
+        exchange.alone = self.conversations.alone
         self._router = exchange.router
         self._clock = clock
         self._profiles: dict[Address, Profile] = {}
@@ -145,10 +146,21 @@ class Calling:
         return self._profile(route).commands()
 
     def greet(self, route: Route) -> None:
-        """Tell the robot what its profile greets it with."""
+        """Tell the robot what its profile greets it with, unless it must hear nothing now."""
         robot = self._robot(route)
+        if robot.address in self.conversations.alone:
+            return
         for request in robot.profile.greeting():
             self._exchange.send(robot.build(request), self._clock())
+
+    async def mend(self, route: Route) -> None:
+        """Bring the robot out of what it was cut off in, then greet it.
+
+        Raises:
+            CallError: it had no turn.
+        """
+        await self.conversations.mend(self._robot(route))
+        self.greet(route)
 
     def learn(self, frame: Frame) -> None:
         """Take note of what a robot says, whether it answers a call or not."""

@@ -1,7 +1,7 @@
 """The one meeting point: every frame that arrives on any link passes here and has its fate written down."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from contextlib import suppress
 from datetime import UTC, datetime
 from math import inf
@@ -25,6 +25,7 @@ from psiu_broker.routing.verdicts import (
     EXPIRED,
     MALFORMED,
     NO_ROUTE,
+    REFUSED,
     SAME_WAY,
     Account,
     Verdict,
@@ -125,6 +126,8 @@ class Exchange:
         """For what the broker asks on each link without having been told to."""
         self.router = router
         self.holding = holding or Holding()
+        self.alone: Set[Address] = frozenset()
+        """Robots that must hear nothing but the broker's own calls now."""
         self._searches = Rarely()
         self.resident: Resident
         self._ports: dict[str, Port] = {}
@@ -163,7 +166,7 @@ class Exchange:
         bus = self.bus
         decision = self.router.route(frame, way, now)
         only = decision.only
-        if only is not None:
+        if only is not None and not (self.alone and frame.destination in self.alone and way is not SELF):
             verdict = self._outlets[only.link].offer(frame, only.peer, way, now, patience_s)
             if bus.listened:
                 self._publish(frame, decision.hops, way)
@@ -334,6 +337,8 @@ class Exchange:
 
     def _carry_out(self, decision: Decision, frame: Frame, way: Way, now: float, patience_s: float) -> Verdict | None:
         match decision.action:
+            case "forward" if way is not SELF and frame.destination in self.alone:
+                return REFUSED
             case "forward":
                 return self._spread(frame, decision.hops, way, now, patience_s)
             case "flood":

@@ -9,11 +9,11 @@ from psiu_broker.codecs.mitya import Mitya
 from psiu_broker.codecs.psiu_ascii import PsiuAscii
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.profiles.hexa import HexaProfile
-from psiu_broker.profiles.mitya import MityaProfile
 from psiu_broker.profiles.mitya_persona import MityaPersona
 from psiu_broker.profiles.persona import Persona
 from psiu_broker.profiles.profile import Profile
 from psiu_broker.profiles.psiu import PsiuProfile
+from psiu_broker.profiles.roboscript import ScriptedMitya
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Protocol:
 PROTOCOLS: Final[Mapping[str, Protocol]] = {
     "psiu-ascii": Protocol(PsiuAscii, PsiuProfile),
     "psiu-hexa": Protocol(PsiuHexa, HexaProfile, numbers=lambda _: range(256)),
-    "mitya": Protocol(Mitya, MityaProfile, MityaPersona),
+    "mitya": Protocol(Mitya, ScriptedMitya, MityaPersona),
 }
 """Every protocol by the name that the user writes as ``protocol``."""
 

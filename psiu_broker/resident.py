@@ -133,7 +133,7 @@ class Resident:
         if link.codec.protocol not in _TALKING:
             for route in self._router.robots():
                 if route.way.link == link.name:
-                    self._calling.greet(route)
+                    self._meet(route)
             return
         if link.codec.protocol == "psiu-ascii" and options.wildcard:
             self._exchange.ask_names(link, now)
@@ -159,7 +159,7 @@ class Resident:
         link = self._exchange.links.get(route.way.link)
         if link is not None and link.adapter.datagrams and route.protocol not in _TALKING:
             # When the link opened, nobody was there to be greeted.
-            self._calling.greet(route)
+            self._meet(route)
 
     def robot_gone(self, route: Route) -> None:
         self._calling.robot_gone(route)
@@ -231,6 +231,19 @@ class Resident:
 
     def _say(self, frame: Frame) -> Verdict | None:
         return self._exchange.send(frame, self._clock())
+
+    def _meet(self, route: Route) -> None:
+        """Greet a robot that is there again; first bring it out of what it was cut off in."""
+        if route.robot in self._conversations.alone and len(self._tasks) < TASKS_KEPT:
+            self._start(self._mend(route))
+        else:
+            self._calling.greet(route)
+
+    async def _mend(self, route: Route) -> None:
+        try:
+            await self._calling.mend(route)
+        except CallError as error:
+            log.warning("%s may still be recording: %s", route.robot, error)
 
     async def _greet(self, route: Route) -> None:
         try:

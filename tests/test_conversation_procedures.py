@@ -98,7 +98,7 @@ async def test_a_cancelled_upload_is_ended_at_once(number: int) -> None:
     assert body.recording is None
     assert body.heard[number:] == ENDING
     assert body.robots.idle
-    assert body.robots.conversations.occupied(MITYA) is None
+    assert MITYA not in body.robots.conversations.alone
 
 
 @pytest.mark.parametrize("number", MESSAGES)
@@ -121,14 +121,14 @@ async def test_after_a_lost_link_the_ending_comes_before_anything_else(number: i
     error = await refused(task)
     assert error.code == "link_down"
     assert "will be told to end it when its link is open again" in str(error)
-    assert body.robots.conversations.occupied(MITYA) == "roboscript-upload"
+    assert MITYA in body.robots.conversations.alone
     assert (await refused(body.call("drive", 100))).code == "link_down"
     body.robots.refuse = None
     assert (await body.call("drive", 100)).remark == "sent; this robot does not answer"
     assert body.heard[number:] == [*ENDING, "D0064"]
     assert body.recording is None
     assert body.done[-1] == "D0064"
-    assert body.robots.conversations.occupied(MITYA) is None
+    assert MITYA not in body.robots.conversations.alone
 
 
 @jumping
@@ -139,12 +139,10 @@ async def test_a_robot_can_be_mended_as_soon_as_its_link_opens() -> None:
     body.robots.conversations.link_down("corpo", "unplugged")
     await refused(task)
     body.robots.refuse = None
-    assert body.robots.conversations.cut("radio") == []
-    (robot,) = body.robots.conversations.cut("corpo")
-    await body.robots.conversations.mend(robot)
+    await body.robots.conversations.mend(body.robot)
     assert (body.recording, body.heard[4:]) == (None, ENDING)
-    assert body.robots.conversations.cut("corpo") == []
-    await body.robots.conversations.mend(robot)
+    assert MITYA not in body.robots.conversations.alone
+    await body.robots.conversations.mend(body.robot)
     assert body.heard[4:] == ENDING
 
 
@@ -155,7 +153,7 @@ async def test_an_ending_that_was_dropped_is_sent_again() -> None:
     body.robots.stuck = True
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert body.robots.conversations.occupied(MITYA) == "roboscript-upload"
+    assert MITYA in body.robots.conversations.alone
     body.robots._kept.clear()
     body.robots.stuck = False
     await body.call("drive", 1)
@@ -189,6 +187,7 @@ async def test_two_stops_end_it_once() -> None:
 async def test_calls_and_commands_wait_until_it_is_over() -> None:
     body = Body(Robots())
     task = await uploading(body, 3)
+    assert body.robots.conversations.alone == {MITYA}
     tell = asyncio.ensure_future(body.robots.conversations.tell(body.robot, "left", [50], fresh_s=5))
     call = asyncio.ensure_future(body.call("drive", 7, timeout_s=5))
     await asyncio.gather(tell, call)
@@ -271,8 +270,7 @@ async def test_nothing_is_ended_that_never_began() -> None:
     body = Body(Robots())
     body.robots.refuse = CallError("link_down", "link corpo is down")
     assert await refused(body.call("roboscript-upload", 3, SCRIPT)) is body.robots.refuse
-    assert body.robots.conversations.occupied(MITYA) is None
-    assert body.robots.conversations.cut("corpo") == []
+    assert MITYA not in body.robots.conversations.alone
 
 
 class TestSilence:

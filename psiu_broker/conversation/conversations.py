@@ -16,7 +16,7 @@ All methods run on the event loop's thread; times are seconds of the loop's cloc
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence, Set
 from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
 from math import inf
@@ -133,13 +133,13 @@ class Conversations:
         async with self._turn(call, replaceable=True):
             self.offer(call, request, call.leave_by)
 
-    def occupied(self, address: Address) -> str | None:
-        """What the robot is at, during which it must hear nothing from anybody else; None: it may be told anything."""
-        return self._procedures.command(address)
+    @property
+    def alone(self) -> Set[Address]:
+        """The robots that must hear nothing from anybody else now; this set changes.
 
-    def cut(self, link: str) -> list[Robot]:
-        """The robots on `link` that are in the middle of a procedure that was cut short: `mend` them first of all."""
-        return self._procedures.cut(link)
+        Where one's link has just opened, it is in the middle of a procedure that was cut short: `mend` it first of all.
+        """
+        return self._procedures.alone
 
     async def mend(self, robot: Robot) -> None:
         """Bring a robot out of the procedure that was cut short, if one was; the next call to it would, too.

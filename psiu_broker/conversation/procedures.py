@@ -48,19 +48,10 @@ class Procedures:
 
     def __init__(self, calls: Calls) -> None:
         self._calls = calls
+        self.alone: Final[set[Address]] = set()
+        """The robots that are at a procedure, or await the ending of one that was cut."""
         self._running: dict[Address, _Running] = {}
-        self._cut: dict[Address, tuple[Robot, Request]] = {}
-
-    def command(self, robot: Address) -> str | None:
-        """What `robot` is at, so that it must hear nothing else; None: it may be told anything."""
-        running, cut = self._running.get(robot), self._cut.get(robot)
-        if running is not None:
-            return running.call.command
-        return None if cut is None else cut[1].subject
-
-    def cut(self, link: str) -> list[Robot]:
-        """The robots on `link` that still await the ending of a procedure."""
-        return [robot for robot, _ in self._cut.values() if robot.link == link]
+        self._cut: dict[Address, Request] = {}
 
     async def interrupt(self, robot: Address, command: str, until: float) -> None:
         """For the sake of `command`, end what `robot` is at and wait until it is out of it, at most until `until`."""
@@ -79,33 +70,41 @@ class Procedures:
         Raises:
             CallError: why there is none, and in what state the robot is.
         """
-        address = call.robot.address
-        running = self._running[address] = _Running(call)
+        running = self._begin(call)
         try:
             if not procedure.steps:
                 return await self._end_only(running, procedure)
             return await self._perform(running, procedure)
         finally:
-            del self._running[address]
-            running.over.set()
+            self._over(running)
 
     async def mend(self, robot: Robot) -> None:
         """Send `robot`, whose turn it is, the ending of the procedure that was cut, if one was; never raises CallError.
 
         It is forgotten once that has left, whatever the robot says.
         """
-        _, request = self._cut.get(robot.address, (None, None))
+        request = self._cut.get(robot.address)
         if request is None or request.procedure is None or robot.address in self._running:
             return
         now = _now()
-        running = _Running(UnderWay(robot, request.subject, request, now, now, now))
-        self._running[robot.address] = running
+        running = self._begin(UnderWay(robot, request.subject, request, now, now, now))
         try:
             with self._calls.hearing(running.call):
                 await self._end(running, request.procedure)
         finally:
-            del self._running[robot.address]
-            running.over.set()
+            self._over(running)
+
+    def _begin(self, call: UnderWay) -> _Running:
+        running = self._running[call.robot.address] = _Running(call)
+        self.alone.add(call.robot.address)
+        return running
+
+    def _over(self, running: _Running) -> None:
+        address = running.call.robot.address
+        del self._running[address]
+        if address not in self._cut:
+            self.alone.discard(address)
+        running.over.set()
 
     async def _perform(self, running: _Running, procedure: Procedure) -> tuple[Reply, float]:
         call = running.call
@@ -126,6 +125,8 @@ class Procedures:
             if call.sent or call.waiting:
                 self._offer_ending(call, procedure)
             raise
+        if reading is None and call.request.silence is not None:
+            return call.request.silence, at
         state = await self._state(running, procedure)
         if reading is None:
             waited = f"{step.pause_s:.3g} s"
@@ -188,9 +189,11 @@ class Procedures:
     def _offer_ending(self, call: UnderWay, procedure: Procedure) -> bool:
         """Whether the ending could be sent; else it is remembered, as it is until it has left."""
         address = call.robot.address
-        self._cut[address] = call.robot, call.request
+        self._cut[address] = call.request
         if len(self._cut) > CUT_KEPT:
-            del self._cut[next(iter(self._cut))]
+            oldest = next(iter(self._cut))
+            del self._cut[oldest]
+            self.alone.discard(oldest)
         try:
             for step in procedure.ending:
                 self._calls.offer(call, _request(call, step), _now() + ENDING_PATIENCE_S, needed=True)

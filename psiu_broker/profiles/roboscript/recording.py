@@ -31,6 +31,8 @@ FIRST_PAUSES: Final = 5
 """r01xx and Zxxxx have so many times as long: to them a body objects that is out of step or has no room."""
 END_S: Final = 2.0
 """How long a body may take to say that it has ended the recording."""
+RELAYED: Final = Reply(None, remark="sent; the phone passes on only what goes wrong, and nothing did")
+"""What silence means where a phone relays."""
 
 
 def upload(parameters: Sequence[Value], vocabulary: Vocabulary, *, datagrams: bool = False) -> Request:
@@ -88,7 +90,8 @@ def _upload(slot: int, script: Script, version: Version, *, datagrams: bool) -> 
     steps[0] = steps[0]._replace(subject=RECORD)  # it is done, not recorded
     steps[-1] = steps[-1]._replace(pause_s=END_S)
     ended = f"it records no longer; upload slot {slot} again before it is played"
-    return Request(UPLOAD, b"", False, END_S, procedure=Procedure(tuple(steps), _ending(version), ended))
+    procedure = Procedure(tuple(steps), _ending(version), ended)
+    return Request(UPLOAD, b"", False, END_S, RELAYED if datagrams else None, procedure)
 
 
 def _step(sent: Message, pause_s: float) -> Step:
