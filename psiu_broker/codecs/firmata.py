@@ -5,7 +5,8 @@
 
 How it is read. A message is whole with its last data byte, a system-exclusive one with F7; there is no
 checksum. Any other byte from 0x80 on breaks off what was begun and begins anew, so that one lost byte costs
-one message. Data bytes that belong to nothing, and bytes that begin nothing, are noise.
+one message. What was broken off, data bytes that belong to nothing and bytes that begin nothing are noise, in one
+piece between two messages.
 
 Which messages there are depends on who speaks. `role` is what the broker is on this link: ``host`` hears a
 board, ``board`` hears a program. Only a program sends C0–DF, F4, F5 and FF, and its F9 has no data.
@@ -172,6 +173,8 @@ class Firmata(Codec):
         self._missing = 0
         """The data bytes that it lacks; negative in a system-exclusive one."""
         self._noise = Noise()
+        """What the last whole message was followed by, besides `_begun`."""
+        self._reason = NOISE
 
     def whole(self, data: bytes) -> Frame | None:
         """The frame, if `data` is one analog or digital message: nearly all that boards say."""
@@ -195,7 +198,7 @@ class Firmata(Codec):
         """Give up what was begun."""
         events: list[Event] = []
         self._give_up(_UNFINISHED, events)
-        self._noise.end(NOISE, events)
+        self._noise.end(self._reason, events)
         self.pending = False
         return events
 
@@ -217,20 +220,22 @@ class Firmata(Codec):
         """Data bytes: for the message that is begun, else for none."""
         begun = self._begun
         if not begun:
-            self._noise.add(data, events)
+            self._waste(data, NOISE, events)
         elif self._missing < 0:
             room = LONGEST - len(begun)
             begun += data[:room]
             if len(data) >= room:
-                self._give_up(_TOO_LONG, events)
-                self._noise.add(data[room:], events)
+                self._noise.end(self._reason, events)
+                events.append(Malformed(_TOO_LONG, bytes(begun[:MALFORMED_KEPT]), len(begun)))
+                begun.clear()
+                self._waste(data[room:], NOISE, events)
         else:
             taken = data[: self._missing]
             begun += taken
             self._missing -= len(taken)
             if self._missing == 0:
                 self._finish(events)
-                self._noise.add(data[len(taken) :], events)
+                self._waste(data[len(taken) :], NOISE, events)
 
     def _take_status(self, status: int, events: list[Event]) -> None:
         """A byte that begins or ends a message, or ought to."""
@@ -244,15 +249,15 @@ class Firmata(Codec):
         self._give_up(_UNFINISHED, events)
         missing = -1 if status == SYSEX else self._said.get(status)
         if missing is None:
-            self._noise.add(bytes((status,)), events)
+            self._waste(bytes((status,)), NOISE, events)
             return
-        self._noise.end(NOISE, events)
         self._begun.append(status)
         self._missing = missing
         if missing == 0:
             self._finish(events)
 
     def _finish(self, events: list[Event]) -> None:
+        self._noise.end(self._reason, events)
         events.append(self._frame(bytes(self._begun)))
         self._begun.clear()
 
@@ -261,5 +266,10 @@ class Firmata(Codec):
 
     def _give_up(self, reason: str, events: list[Event]) -> None:
         if self._begun:
-            events.append(Malformed(reason, bytes(self._begun[:MALFORMED_KEPT]), len(self._begun)))
+            self._waste(self._begun, reason, events)
             self._begun.clear()
+
+    def _waste(self, data: bytes | bytearray, reason: str, events: list[Event]) -> None:
+        """Lengthen the noise, which is for `reason` where it is nothing else."""
+        self._reason = NOISE if self._noise.size else reason
+        self._noise.add(data, events)
