@@ -50,9 +50,12 @@ class DraftRun(Run):
 
     def size_field(self, text: bytes | bytearray, edge: int = 0, begin: int = 1) -> re.Match[bytes] | None:
         """The first three digits, from `begin` on, behind a known name that begins at `edge` or later."""
+        lengths: set[int] = set()
         for size in _SIZE.finditer(text, begin):
-            name = text[max(edge, size.start() - LONGEST_NAME) : size.start()].decode("ascii", "replace")
-            if any(self._is_known(name[at:]) for at in range(len(name))):
+            lengths = lengths or {len(EVERYONE.name), *map(len, self._directory.all_names)}
+            end = size.start()
+            names = (text[end - each : end] for each in lengths if 0 < each <= end - edge)
+            if any(self._is_known(name.decode("ascii", "replace")) for name in names):
                 return size
         return None
 

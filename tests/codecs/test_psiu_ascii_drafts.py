@@ -1,6 +1,7 @@
 """Drafts 0 and 0.5 of PSIU ASCII: no spaces around the size, and in 0 no sender."""
 
 import json
+import time
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -235,6 +236,13 @@ def test_a_sender_that_cannot_be_written_matters_only_where_it_is() -> None:
         draft("0.5").encode(frame)
 
 
+@pytest.mark.parametrize("version", VERSIONS)
+def test_bytes_that_are_no_text_may_stand_before_digits(version: str) -> None:
+    codec = draft(version, "PC", "")
+    assert reasons(read(codec, b"\xe1\xff123 45678\xe1PC")) == ["noise"]
+    assert wires(codec.decode(b"123" + FRAMES[version], 0.0)) == [FRAMES[version]]
+
+
 printable = st.characters(min_codepoint=0x20, max_codepoint=0x7E)
 word = st.text(printable.filter(lambda char: char != " "), min_size=1, max_size=12)
 name = st.sampled_from([*NAMES, "??"])
@@ -340,3 +348,20 @@ def test_endless_input_holds_bounded_memory(chosen: str, pattern: bytes) -> None
         assert len(codec._run.fits) <= 800
         assert codec._noise.size <= 4096
     codec.flush(0.0)
+
+
+@pytest.mark.parametrize("pattern", ENDLESS, ids=lambda pattern: repr(pattern[:20]))
+@pytest.mark.parametrize("chosen", VERSIONS)
+def test_a_byte_of_a_long_input_costs_no_more_than_one_of_a_short_input(chosen: str, pattern: bytes) -> None:
+    def cost_s(size: int, rounds: int) -> float:
+        data = (pattern * (size // len(pattern) + 1))[:size]
+        costs = []
+        for _ in range(rounds):
+            codec = draft(chosen)
+            start = time.process_time()
+            codec.decode(data, 0.0)
+            codec.flush(0.0)
+            costs.append((time.process_time() - start) / size)
+        return min(costs)
+
+    assert cost_s(64_000, 1) < 16 * cost_s(2_000, 10)
