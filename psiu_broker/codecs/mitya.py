@@ -90,6 +90,11 @@ def message(letter: str, value: int) -> bytes:
     return b"%b%04X" % (letter.encode("ascii"), value & 0xFFFF)
 
 
+def is_message(payload: bytes) -> bool:
+    """Whether `payload` is a letter and four hexadecimal digits."""
+    return _MESSAGE.fullmatch(payload) is not None
+
+
 def number(payload: bytes) -> int:
     """The value 0…65535 of a message."""
     return int(payload[1:MESSAGE_BYTES], 16)
@@ -175,7 +180,7 @@ class Mitya(Codec):
             raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
         if frame.subject == REALIGN:
             return frame.payload
-        if _MESSAGE.fullmatch(frame.payload) is None:
+        if not is_message(frame.payload):
             raise EncodeError(f"{frame.payload!r} is not a letter and four hexadecimal digits")
         word = frame.subject.removeprefix(SCRIPT)
         letter = self._letter(word, frame.payload)
@@ -237,6 +242,8 @@ class Mitya(Codec):
     def _counted_off(self, digits: bytes, events: list[Event], now: float) -> bytes:
         """Take the messages that end where `digits` end; what is before them."""
         start = len(digits)
+        if not _DIGITS.issuperset(digits):  # a letter whose message was cut off
+            return digits
         while start >= MESSAGE_BYTES and digits[start - MESSAGE_BYTES] in self._known:
             start -= MESSAGE_BYTES
         if start < len(digits):

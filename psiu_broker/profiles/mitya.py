@@ -180,9 +180,11 @@ class _Form(NamedTuple):
 class Realigner:
     """Brings a 2012 body, which cuts what it hears in fives for ever, back into step.
 
-    ``W0000`` is no command outside a script: a body in step objects with E0007, one out of step with E0001, for to it W
-    is a digit. So it is asked, and after each E0001 asked again behind one more byte, five times at most. An E0001 ends
-    any recording, so that nothing asked after one disturbs it. It needs no clock: what is not answered is not repeated.
+    ``W0000`` is no command outside a script: a body in step objects with E0007, one out of step with E0001, since to
+    it W stands for a digit. So it is asked, and after each E0001 asked again behind one more byte, five times at most.
+    What makes it begin is an E0001, or an E0002, which a command that is cut at a wrong place may cause too. An E0001
+    ends any recording, so that nothing asked after it disturbs one. It needs no clock: an answer that does not come is
+    not waited for.
     """
 
     def __init__(self) -> None:
@@ -205,12 +207,12 @@ class Realigner:
 
     def heard(self, frame: Frame) -> bool:
         """Take note of a frame of the body; True if something is to be sent: call `next`."""
-        if frame.subject != "error":
+        if frame.subject != "error" or not mitya.is_message(frame.payload):
             return False
         code = mitya.number(frame.payload)
         if not self.asking:
             self._taken = None
-            return code == 0x01
+            return code in (0x01, 0x02)
         if code in (0x04, 0x06, 0x07):  # W was read as a letter, by a body that was recording or not
             self.asking, self.in_step, self._taken = False, True, frame
         elif code == 0x01:
@@ -302,6 +304,8 @@ class MityaProfile(Profile):
         return Request(form.word, payload, question, self._timeout_s, None if self._answers else SENT)
 
     def read(self, request: Request, frame: Frame) -> Reading | None:
+        if not mitya.is_message(frame.payload):
+            return None
         if self._realigner is not None and self._realigner.took(frame):
             return None
         if frame.subject == "telemetry" and request.subject == "battery":
@@ -335,10 +339,9 @@ class MityaProfile(Profile):
 
     def describe(self, frame: Frame) -> Description:
         word = frame.subject.removeprefix(SCRIPT)
-        try:
-            value = mitya.number(frame.payload)
-        except ValueError:
+        if not mitya.is_message(frame.payload):
             return {"kind": "command", "command": frame.subject}
+        value = mitya.number(frame.payload)
         if frame.subject == DONE:
             return {"kind": "response", "command": None, "status": "sucesso"}
         if frame.subject == "error":

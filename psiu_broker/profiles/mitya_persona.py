@@ -117,11 +117,9 @@ class MityaPersona(Persona):
         self._rarely = Rarely()
 
     def heard(self, frame: Frame, now: float) -> Sequence[Say | Call]:
-        word = frame.subject
-        try:
-            value = mitya.signed(frame.payload)
-        except ValueError:
+        if not mitya.is_message(frame.payload):
             return ()
+        word, value = frame.subject, mitya.signed(frame.payload)
         if self._is_void(word, value):
             return ()
         rule = self._rules.get(word)
