@@ -559,7 +559,7 @@ async def run(link: Link) -> None:
 async def test_a_team_on_a_serial_line_of_2000_baud_is_driven_and_stopped(tmp_path: Path) -> None:
     team = SoccerRobot.team("cendori")
     async with PtyPort(*team, link=tmp_path / "radio") as port:
-        made = configuration(Serial(device=port.path, baudrate=2000), preset="cendori", rate_hz=11)
+        made = configuration(Serial(device=port.path, baudrate=2000), preset="cendori", rate_hz=11, hold_s=1.5)
         hub = Ledger()
         link = PacedLink(made, lambda: Soccer(cast(Any, made.codec)), cast(Hub, hub))
         task = asyncio.create_task(run(link))
@@ -593,7 +593,7 @@ async def test_a_team_over_udp_is_driven() -> None:
     team = SoccerRobot.team("mirosot")
     async with UdpPort(*team) as port:
         adapter = Udp(listen="127.0.0.1:0", peers=(port.address,), learn=False)
-        made = configuration(adapter)
+        made = configuration(adapter, hold_s=3600)
         link = PacedLink(made, lambda: Soccer(cast(Any, made.codec)), cast(Hub, Ledger()))
         task = asyncio.create_task(run(link))
         await port.until(lambda: team[2].packets > 0)
