@@ -23,10 +23,11 @@ from psiu_broker import __version__
 from psiu_broker.bus.bus import Bus
 from psiu_broker.codecs.directories import Directories
 from psiu_broker.codecs.identity import identity
+from psiu_broker.codecs.paced import PacedCodec
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config import Configuration, LinkConfiguration
 from psiu_broker.config.shown import shown
-from psiu_broker.config.who import bindings, ends, own_addresses
+from psiu_broker.config.who import bindings, ends, own_addresses, rests_of
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange, NoBus
 from psiu_broker.frame import MESH, Address, Frame, Way
@@ -40,6 +41,7 @@ from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Rout
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
+from psiu_broker.paced_link import PacedLink
 from psiu_broker.profiles import Description
 from psiu_broker.protocols import CODECS
 from psiu_broker.pulse import Pulse
@@ -326,12 +328,16 @@ class Broker:
         domain = options.domain if isinstance(options, PsiuHexa.Options) else ""
         codec = CODECS[configuration.protocol]
         directory = self._directories.of(domain)
+        there = ends(self.configuration, configuration)
+        if issubclass(codec, PacedCodec):
+            rests = rests_of(self.configuration, configuration)
+            return PacedLink(configuration, lambda: codec(options, directory), self.exchange, rests=rests, ends=there)
         return Link(
             configuration,
             lambda: codec(options, directory, datagrams=configuration.adapter.datagrams),
             self.exchange,
             unaddressed=isinstance(options, PsiuHexa.Options) and options.topology != "ad-hoc",
-            ends=ends(self.configuration, configuration),
+            ends=there,
         )
 
     # Inside: the bus, opened and kept open.

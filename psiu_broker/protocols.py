@@ -4,16 +4,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from psiu_broker.codecs.amarino import Amarino
 from psiu_broker.codecs.codec import Codec
+from psiu_broker.codecs.firmata import Firmata
 from psiu_broker.codecs.mitya import Mitya
 from psiu_broker.codecs.psiu_ascii import PsiuAscii
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.codecs.soccer import Soccer
+from psiu_broker.profiles.amarino import AmarinoProfile
+from psiu_broker.profiles.amarino_persona import AmarinoPersona
+from psiu_broker.profiles.firmata import FirmataProfile
+from psiu_broker.profiles.firmata_persona import FirmataPersona
 from psiu_broker.profiles.hexa import HexaProfile
 from psiu_broker.profiles.mitya_persona import MityaPersona
 from psiu_broker.profiles.persona import Persona
 from psiu_broker.profiles.profile import Profile
 from psiu_broker.profiles.psiu import PsiuProfile
 from psiu_broker.profiles.roboscript import ScriptedMitya
+from psiu_broker.profiles.soccer import SoccerProfile
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +41,9 @@ PROTOCOLS: Final[Mapping[str, Protocol]] = {
     "psiu-ascii": Protocol(PsiuAscii, PsiuProfile),
     "psiu-hexa": Protocol(PsiuHexa, HexaProfile, numbers=lambda _: range(256)),
     "mitya": Protocol(Mitya, ScriptedMitya, MityaPersona),
+    "soccer": Protocol(Soccer, SoccerProfile, numbers=lambda options: range(1, options.robots + 1)),
+    "firmata": Protocol(Firmata, FirmataProfile, FirmataPersona),
+    "amarino": Protocol(Amarino, AmarinoProfile, AmarinoPersona),
 }
 """Every protocol by the name that the user writes as ``protocol``."""
 

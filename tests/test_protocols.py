@@ -20,7 +20,10 @@ from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Answer, CallRequest, Card
 from psiu_broker.simulator import AsciiRobot, PtyPort
+from psiu_broker.simulator.amarino import AmarinoBoard
+from psiu_broker.simulator.firmata import FirmataBoard
 from psiu_broker.simulator.mitya import MityaBody
+from psiu_broker.simulator.soccer import SoccerRobot
 
 CODEC = PsiuAscii(PsiuAscii.Options(), Directory())
 
@@ -109,7 +112,7 @@ async def test_a_mitya_is_called_by_letter_or_by_name_and_lists_its_commands(tmp
     body = MityaBody("MITYA", version="2013")
     port = PtyPort(body, link=tmp_path / "corpo")
     text = link("corpo", port.path, "mitya", 'version = "2013"') + '[robots.MITYA]\nlink = "corpo"\n'
-    async with lab(tmp_path, text, port) as made, made.listening("psiu/MITYA/**") as heard:
+    async with lab(tmp_path, text, port) as made, made.listening("psiu/MITYA/*/**") as heard:
         answer = await made.call("MITYA", "G", 100)
         assert answer is not None
         assert answer.status == "sucesso"
@@ -182,3 +185,80 @@ link = "radio"
             complaint = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(program, 100), 2.0)
             assert complaint == b"E0102"
         assert made.broker.ledger().total.arrived > 0
+
+
+async def test_robots_of_a_team_are_told_their_wheels_in_packets_that_all_of_them_hear(tmp_path: Path) -> None:
+    team = [SoccerRobot(number) for number in (1, 2, 3)]
+    port = PtyPort(*team, link=tmp_path / "campo")
+    text = (
+        link("campo", port.path, "soccer", 'preset = "mirosot"\nrate_hz = 30')
+        + '[robots.GOLEIRO]\nlink = "campo"\naddress = 1\n'
+        + '[robots.ATACANTE]\nlink = "campo"\naddress = 3\nhold_s = 0.2\n'
+    )
+    async with lab(tmp_path, text, port) as made, made.listening("psiu/*/*/rodas") as heard:
+        answer = await made.call("GOLEIRO", "rodas", 15, -31)
+        assert answer is not None
+        assert answer.remark == "sent; this robot does not answer"
+        await until(lambda: team[0].wheels == (15, -31))
+        assert team[1].wheels == (0, 0)
+        await made.call("ATACANTE", "rodas", 31, 31)
+        await until(lambda: team[2].wheels == (31, 31))
+        await until(lambda: team[2].wheels == (0, 0))  # hold_s is over
+        with pytest.raises(CallError, match="-31"):
+            await made.call("GOLEIRO", "rodas", 32, 0)
+        await until(lambda: len(heard) == 2)
+        assert [each["destination"] for each in heard] == ["GOLEIRO", "ATACANTE"]
+        assert made.card("GOLEIRO").address == "campo.0x01"
+        details = made.broker.links()[0].details
+        assert details["rate_hz"] == 30
+
+
+async def test_a_board_that_speaks_firmata_is_a_robot_with_named_pins(tmp_path: Path) -> None:
+    board = FirmataBoard("PLACA")
+    port = PtyPort(board, link=tmp_path / "placa")
+    text = (
+        link("placa", port.path, "firmata")
+        + '[robots.PLACA]\nlink = "placa"\npins.farol = { pin = 13, mode = "output" }\n'
+        + 'pins.luz = { pin = "A0", mode = "analog" }\n'
+    )
+    async with lab(tmp_path, text, port) as made, made.listening("psiu/PLACA/*/**") as heard:
+        await until(lambda: made.card("PLACA").last_heard is not None)
+        answer = await made.call("PLACA", "farol", "on")
+        assert answer is not None
+        assert answer.status == "sucesso"
+        assert board.states[13] == 1
+        board.set_pin(14, 512)
+        await until(lambda: any(each.get("readings") == {"luz": 512} for each in heard))
+        answer = await made.call("PLACA", "luz")
+        assert answer is not None
+        assert answer.values == [512]
+
+
+async def test_an_amarino_board_is_a_robot_whose_functions_have_names(tmp_path: Path) -> None:
+    board = AmarinoBoard("LUZES", functions={"A": None, "C": "42"}, readings=(21.5, 3.0), telemetry_s=0.1)
+    port = PtyPort(board, link=tmp_path / "luzes")
+    text = (
+        link("luzes", port.path, "amarino")
+        + '[robots.LUZES]\nlink = "luzes"\n'
+        + 'commands.brilho = { flag = "A", parameters = ["int"], minimum = 0, maximum = 255 }\n'
+        + 'commands.conta = { flag = "C", answer = true }\n'
+    )
+    async with lab(tmp_path, text, port) as made, made.listening("psiu/LUZES/*/**") as heard:
+        answer = await made.call("LUZES", "brilho", 200)
+        assert answer is not None
+        assert answer.remark == "sent; this robot does not answer"
+        await until(lambda: board.heard and board.heard[-1].parameters == ("200",))
+        with pytest.raises(CallError, match="255"):
+            await made.call("LUZES", "brilho", 256)
+        await until(lambda: heard)
+        assert heard[0]["kind"] == "event"
+        assert not board.crashed
+
+
+async def test_a_robot_is_found_where_the_link_is_its_only_name(tmp_path: Path) -> None:
+    port = PtyPort(MityaBody("M", version="2013", telemetry_s=0.05), link=tmp_path / "corpo")
+    async with lab(tmp_path, link("corpo", port.path, "mitya", 'version = "2013"'), port) as made:
+        await until(lambda: made.broker.card(Address.parse("corpo")) is not None)
+        answer = await made.call("corpo", "drive", 10)
+        assert answer is not None
+        assert answer.status == "sucesso"

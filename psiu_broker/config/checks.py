@@ -8,6 +8,7 @@ from typing import Final
 
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.codecs.soccer import Soccer, rate_trouble
 from psiu_broker.config.problems import Key, Problems, got, suggestion
 from psiu_broker.config.tables import (
     ENDPOINT,
@@ -107,6 +108,13 @@ def check_far_end(
     # Where a robot's table says who is there, the same mistake is its address's.
     if "remote" in written and codec.remote == codec.local:
         problems.add((*key, "remote"), f"{got(codec.remote)} is the broker's own address there; give the robot's")
+
+
+def check_rate(adapter: Adapter, codec: Soccer.Options, key: Key, problems: Problems) -> None:
+    """The line carries so many packets a second."""
+    trouble = rate_trouble(codec, adapter.bits_per_second)
+    if trouble is not None:
+        problems.add((*key, "rate_hz"), trouble)
 
 
 def check_identities(

@@ -12,12 +12,14 @@ from pydantic import BaseModel
 
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
+from psiu_broker.codecs.soccer import Soccer
 from psiu_broker.config.checks import (
     check_devices,
     check_ends,
     check_far_end,
     check_identities,
     check_nodes,
+    check_rate,
     check_trunk,
     warnings_about,
 )
@@ -136,6 +138,8 @@ def _link(
         codec = problems.read(codec_model, mine, key)
         if adapter and isinstance(codec, PsiuHexa.Options):
             check_far_end(adapter, codec, table, key, problems)
+        if adapter and isinstance(codec, Soccer.Options):
+            check_rate(adapter, codec, key, problems)
     persona = _persona(table, protocol, key, problems) if options and options.plays is not None else None
     if adapter_model and codec_model:
         models: tuple[type[BaseModel], ...] = (adapter_model, codec_model, LinkOptions)
@@ -270,6 +274,10 @@ def _robot(
             problems.add((*key, "peer"), str(error))
     if options is None:
         return None
+    try:
+        protocol.profile.make(link.codec, options, link.options.timeout_s, datagrams=link.adapter.datagrams)
+    except ValueError as error:
+        problems.add(key, str(error))
     return RobotConfiguration(name, robot.link, link.protocol, address, peer, options)
 
 

@@ -4,11 +4,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from psiu_broker.adapter import Peer
+from psiu_broker.codecs.paced import Rest
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config.tables import Configuration, LinkConfiguration, domain_of
 from psiu_broker.frame import NOBODY, Address, Frame, Way, peer_text
 from psiu_broker.profiles import Description, Node, describe
 from psiu_broker.profiles.hexa import HexaOptions
+from psiu_broker.profiles.soccer import SoccerProfile
+from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.routing.table import Binding
 
 
@@ -77,6 +80,16 @@ def ends(configuration: Configuration, link: LinkConfiguration) -> Ends:
     return Ends(
         link.name, Address.named(plays or configuration.broker.name), plays is not None, domain_of(link), robots
     )
+
+
+def rests_of(configuration: Configuration, link: LinkConfiguration) -> dict[int, Rest]:
+    """What stops each robot of a link whose packets tell all of them at once, by number."""
+    made = {
+        robot.address.number: PROTOCOLS[link.protocol].profile.make(link.codec, robot.options, link.options.timeout_s)
+        for robot in configuration.robots.values()
+        if robot.link == link.name and robot.address is not None
+    }
+    return {number: profile.rest for number, profile in made.items() if isinstance(profile, SoccerProfile)}
 
 
 def describer(configuration: Configuration) -> Callable[[Frame], Description]:

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from psiu_broker.protocols import CODECS
 from psiu_broker.codecs.checksums import CHECKS
 from psiu_broker.codecs.codec import Directory, Event
 from psiu_broker.codecs.fragments import LONGEST_PAYLOAD, REASSEMBLY_S
 from psiu_broker.codecs.psiu_hexa import PsiuHexa, fields, join_fields, packet
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import NOBODY, Address, Frame, Malformed
+from psiu_broker.protocols import CODECS
 
 VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "psiu-hexa.json").read_text())["packets"]
 SUBJECTS = {
