@@ -262,8 +262,6 @@ class MityaProfile(Profile):
         """
         codec, robot = codec or mitya.Mitya.Options(), robot or self.Options()
         self.version: Version = codec.version
-        self.recording = False
-        """While true the body is at a script, and nothing is asked to realign it; whoever uploads sets it."""
         self._forms = {name: form for name, form in _forms(self.version).items() if form.letter}
         for name, command in robot.commands.items():
             self._forms[name] = _own(name, command, self.version)
@@ -328,14 +326,14 @@ class MityaProfile(Profile):
         return ""
 
     def greeting(self) -> Sequence[Request]:
-        """The next question by which a 2012 body is realigned, where there is one to ask."""
-        if self._realigner is None or self.recording:
+        """The next question by which a 2012 body is realigned; not for one that is recording a script."""
+        if self._realigner is None:
             return ()
         return (Request(REALIGN, self._realigner.next(), True, self._timeout_s, SENT),)
 
     def learn(self, frame: Frame) -> bool:
         """True when the body may be out of step, and the next `greeting` asks on."""
-        return self._realigner is not None and not self.recording and self._realigner.heard(frame)
+        return self._realigner is not None and self._realigner.heard(frame)
 
     def describe(self, frame: Frame) -> Description:
         word = frame.subject.removeprefix(SCRIPT)

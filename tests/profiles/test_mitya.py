@@ -457,11 +457,18 @@ class TestRealignment:
         assert one.asking
         assert one.in_step is None
 
-    def test_never_while_a_script_is_recorded(self) -> None:
-        robot = profile()
-        robot.recording = True
-        assert list(robot.greeting()) == []
-        assert not robot.learn(heard("E0001"))
+    def test_nothing_is_asked_of_a_body_that_records_for_the_error_ends_the_recording(self) -> None:
+        line = Line()
+        line.greet()
+        for step in (b"r0100", b"Z0002", b"D0064"):
+            assert line.body.receive(step, 0.0) == []
+        (sent,) = line.sent
+        assert sent == b"W0000"
+        line.body.receive(b"W", 0.0)
+        line.send(line.robot.request("L", [7]))  # WL000
+        assert line.body.recording is None
+        line.send(line.robot.request("L", [7]))
+        assert line.body.body.left == 7
 
     def test_only_a_2012_body_on_a_line_that_wants_it(self) -> None:
         for robot in (profile(realign=False), profile("2013"), profile("2014"), profile(datagrams=True)):
