@@ -145,6 +145,11 @@ class Broker:
 
     async def stop(self) -> None:
         """Refuse new calls, let what waits go out, close the links, then the bus."""
+        for task in self._tasks:
+            if task.get_name() == "bus":
+                # Else it might open another session meanwhile, of which nobody takes leave.
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
         if self._bus is not None:
             await self._bus.retire()
         await self.resident.close()

@@ -371,3 +371,22 @@ async def test_a_call_that_came_while_the_broker_stood_still_moves_nothing(lab: 
         await asyncio.sleep(0)
     await asyncio.sleep(pulse.STALE_S + 2 * broker_module.TICK_S)
     assert (await lab.call("MNERIM", "parafrente", 1)).status == "sucesso"
+
+
+async def test_a_broker_that_stops_opens_no_bus_again(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[object] = []
+    keeper = next(task for task in lab.broker._tasks if task.get_name() == "bus")
+    closed = lab.broker.resident.close
+
+    async def close() -> None:
+        await closed()
+        await until(lambda: opened or keeper.done())
+
+    async def open_bus(*_: object) -> None:
+        opened.append(True)
+
+    monkeypatch.setattr(lab.broker.resident, "close", close)
+    monkeypatch.setattr(lab.broker, "_open_bus", open_bus)
+    lab.broker._bus_lost.set()
+    await lab.broker.stop()
+    assert opened == []

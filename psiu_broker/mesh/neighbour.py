@@ -18,6 +18,10 @@ SILENT_S: Final = 2.2
 NEWCOMER_S: Final = 0.9
 """Of a broker that has just been announced, a beat should have come by then."""
 STEP_EVERY_S: Final = 1.5
+UNHEARD_MAX: Final = 2
+"""Frames may be under way when they are counted. When none of the count before has come either, they are lost."""
+IDLE_MAX: Final = 4
+"""After so many counts without a new frame nobody knows whether one would come."""
 OFFSETS: Final = 64
 ROUND_TRIPS: Final = 8
 
@@ -59,12 +63,15 @@ class Neighbour:
         """Since when its beats do not mention ours."""
         self.differs_since: float | None = None
         """Since when what it says that it claims is not what we have seen announced."""
+        self.unheard = 0
+        """Of how many counts in a row nothing that it sent has come; see `UNHEARD_MAX`."""
         self.remedy = Remedy()
         self.sent: dict[int, int] = {}
         """How many frames we sent it, by lane."""
         self.received: dict[int, Sequence] = {}
         self.doubles = 0
         self._sent_us = 0
+        self._counted = self._come = self._idle = 0
         self._offsets: deque[float] = deque(maxlen=OFFSETS)
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)
 
@@ -95,6 +102,7 @@ class Neighbour:
         """It was only out of sight, and the series of frames go on."""
         self.since = now
         self.beat_at = self.deaf_since = self.differs_since = None
+        self.unheard = 0
         self._offsets.clear()  # its clock stands still while it sleeps
 
     def beat(self, beat: Beat, own: str, own_epoch: int, now: float) -> None:
@@ -108,6 +116,8 @@ class Neighbour:
                 self._series(lane).expect(counts[lane])
         if beat.heard is None:
             return
+        if meant_for == own_epoch:
+            self._note_unheard(sum(counts.values()))
         echo = beat.heard.get(own)
         if echo is None:
             self.deaf_since = now if self.deaf_since is None else self.deaf_since
@@ -139,6 +149,20 @@ class Neighbour:
         new = self._series(lane).take(number)
         self.doubles += not new
         return new
+
+    def _note_unheard(self, sent: int) -> None:
+        """It says that it has sent us so many frames by now."""
+        come = self.frames_in
+        if come > self._come or sent < self._counted:
+            self.unheard = self._idle = 0
+        elif sent > self._counted:
+            self.unheard += 1
+            self._idle = 0
+        else:
+            self._idle += 1
+            if self._idle > IDLE_MAX:
+                self.unheard = 0
+        self._counted, self._come = sent, come
 
     def _correct_offsets(self, least: float) -> None:
         """Its clock reads at least so much less than ours, as no beat takes longer than a whole round trip.

@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from psiu_broker.mesh.beat import Beat, Notice
 from psiu_broker.mesh.bus import MeshBus, NoBus
-from psiu_broker.mesh.neighbour import NEWCOMER_S, SILENT_S, Neighbour, Neighbours, Remedy
+from psiu_broker.mesh.neighbour import NEWCOMER_S, SILENT_S, UNHEARD_MAX, Neighbour, Neighbours, Remedy
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ HANG_UP_EVERY_S: Final = 8.0
 DIFFERS_S: Final = 1.0
 STRANGERS_MAX: Final = 256
 
-Trouble = Literal["silent", "deaf", "unclear"]
+Trouble = Literal["silent", "deaf", "unclear", "heard in part"]
 
 
 class _Stranger:
@@ -131,6 +131,8 @@ class Remedies:
             return "deaf"
         if neighbour.differs_since is not None and now - neighbour.differs_since > DIFFERS_S:
             return "unclear"
+        if neighbour.unheard >= UNHEARD_MAX:
+            return "heard in part"  # its beats come, and the frames that it counts in them do not
         return None
 
     def _remedy(self, name: str, zenoh_id: str, remedy: Remedy, trouble: str, now: float) -> None:

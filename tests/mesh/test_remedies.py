@@ -40,9 +40,11 @@ class World:
         self.now = 0.0
         self.beat()
 
-    def beat(self, *, hears_us: bool = True) -> None:
+    def beat(self, *, hears_us: bool = True, sent: int = 0) -> None:
+        """B's beat, which says that it has sent us so many frames."""
         heard = {"A": (int(self.now * 1e6), 0)} if hears_us else {}
-        self.b.beat(Beat(broker="B", epoch=7, sent_us=int(self.now * 1e6), heard=heard), "A", 1, self.now)
+        told = {"A": (1, {1: sent})} if sent else {}
+        self.b.beat(Beat(broker="B", epoch=7, sent_us=int(self.now * 1e6), heard=heard, sent=told), "A", 1, self.now)
 
     def stranger(self, name: str = "C") -> None:
         self.remedies.stranger(Beat(broker=name, epoch=7, zenoh_id=f"id{name}", sent_us=0), self.now)
@@ -140,3 +142,31 @@ def test_everything_is_declared_anew_once_however_many_ask_and_later_when_it_jus
 def test_without_a_bus_nothing_is_done(world: World) -> None:
     world.remedies.detach()
     assert world.run(60) == []
+
+
+def test_a_broker_whose_beats_come_and_whose_frames_do_not_is_told_of_us_anew(world: World) -> None:
+    world.bus.linked = {"idB"}
+    done: list[str] = []
+    for sent in range(1, 20):
+        world.now += 2 * BEAT_S
+        world.beat(sent=sent)
+        world.remedies.tick(world.now)
+        done += world.bus.done
+        world.bus.done.clear()
+    assert done[:3] == ["declare anew", "declare anew", "hang up idB"]
+
+
+def test_a_frame_that_is_still_under_way_when_it_is_counted_is_no_trouble(world: World) -> None:
+    for sent in range(1, 60):
+        world.now += 2 * BEAT_S
+        world.beat(sent=sent)
+        world.b.take(1, sent)
+        world.remedies.tick(world.now)
+    assert world.bus.done == []
+
+
+def test_what_was_lost_of_a_broker_that_sends_no_more_is_forgotten(world: World) -> None:
+    for sent in (1, 2, 2, 2, 2, 2, 2, 2):
+        world.now += 2 * BEAT_S
+        world.beat(sent=sent)
+    assert world.run(10, beats=True) == []
