@@ -1,8 +1,8 @@
 """A program on the bus: what the `psiu` tool uses. Everything here waits; nothing needs an event loop."""
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Final, Literal
 from uuid import uuid4
 
@@ -123,6 +123,22 @@ class Client:
                     yield str(sample.key_expr), kind, sample.payload.to_bytes()
         except zenoh.ZError as error:
             raise BusError(f"zenoh: {plain(error)}") from error
+
+    @contextmanager
+    def listening(self, key: str, take: Callable[[bytes], None]) -> Iterator[None]:
+        """Hand every payload put under `key` to `take`, on a thread of Zenoh's, for as long as the block lasts.
+
+        `take` may neither wait nor raise.
+        """
+        try:
+            subscriber = self._session.declare_subscriber(_checked(key), lambda sample: take(sample.payload.to_bytes()))
+        except zenoh.ZError as error:
+            raise BusError(f"zenoh: {plain(error)}") from error
+        try:
+            yield
+        finally:
+            with suppress(zenoh.ZError):
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _call_key(self, robot: Address | str, command: str) -> str:
         return _checked(self.keys.call(Address.parse(robot) if isinstance(robot, str) else robot, command))

@@ -27,6 +27,7 @@ _HERE: Final = "psiu_broker.cli"
         "status": ("Show how the broker is.", f"{_HERE}.tables:status"),
         "decode": ("Decode bytes into frames.", f"{_HERE}.decode:decode"),
         "encode": ("Encode a frame into bytes.", f"{_HERE}.encode:encode"),
+        "roboscript": ("Check, upload and play the scripts of a Robot Mitya.", f"{_HERE}.roboscript:roboscript"),
         "sim": ("Be a simulated robot.", f"{_HERE}.sim:sim"),
         "schema": ("Print the JSON schema of the messages.", f"{_HERE}.schema:schema"),
     },

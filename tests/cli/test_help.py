@@ -28,6 +28,7 @@ ON_THE_BUS = (
     "status",
 )
 ALONE = ("decode", "encode", "sim", "schema")
+GROUPS = ("roboscript",)
 
 
 @pytest.mark.parametrize("command", [*ON_THE_BUS, *ALONE])
@@ -39,6 +40,16 @@ def test_the_help_of_every_tool_command_has_examples_and_offers_json(tool: Run, 
     assert ("--connect" in shown.output) == (command in ON_THE_BUS)
 
 
+@pytest.mark.parametrize("command", ["check", "upload", "play", "abort", "decompile"])
+def test_the_help_of_every_roboscript_command_has_examples_and_offers_json(tool: Run, command: str) -> None:
+    assert command in tool("roboscript", "--help").output
+    shown = tool("roboscript", command, "--help")
+    assert shown.exit_code == 0
+    assert "Examples:" in shown.output
+    assert f"psiu roboscript {command}" in shown.output
+    assert "--json" in shown.output
+
+
 @pytest.mark.parametrize("command", ["run", "check", "schema", "demo"])
 def test_the_help_of_every_daemon_command_has_examples(daemon: Run, command: str) -> None:
     shown = daemon(command, "--help")
@@ -47,7 +58,7 @@ def test_the_help_of_every_daemon_command_has_examples(daemon: Run, command: str
 
 
 def test_every_command_is_tested_here() -> None:
-    assert set(psiu.list_commands(None)) == {*ON_THE_BUS, *ALONE}  # type: ignore[arg-type]
+    assert set(psiu.list_commands(None)) == {*ON_THE_BUS, *ALONE, *GROUPS}  # type: ignore[arg-type]
     assert set(psiu_broker.list_commands(None)) == {"run", "check", "schema", "demo"}  # type: ignore[arg-type]
 
 

@@ -17,8 +17,8 @@ ACTIONS_MAX: Final = 130
 """About as many fit into the memory of a body."""
 TOTAL_MS: Final = 65_500
 """The delays of a script must be less than this together: a body counts them in 16 bits."""
-TEXT_MAX: Final = 32_768
-"""Characters of a script; the rest would be comments."""
+TEXT_MAX: Final = 30_000
+"""Bytes of a script's text, which has to fit into a call; the rest would be comments."""
 PROBLEMS_SHOWN: Final = 50
 """Of more than these the rest is counted."""
 
