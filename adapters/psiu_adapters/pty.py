@@ -98,7 +98,7 @@ class Board(Transport):
         self._visits = 0
         self._holders = 0
         self._closed = False
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.Handle | None = None
         self._openings = _openings()
         try:
             self._offer(terminal)
@@ -108,7 +108,8 @@ class Board(Transport):
         if self._openings is not None:
             self._loop.add_reader(self._openings.fd, self._noticed)
         else:
-            self._look()
+            # Nobody is told of before the link has its transport.
+            self._timer = self._loop.call_soon(self._look)
 
     @property
     def peers(self) -> Collection[Peer]:

@@ -93,10 +93,10 @@ class PlayedPin(BaseModel):
             ValueError: it is out of range; the text says of which.
         """
         number = round(value * self.scale + self.offset, self.decimals)
-        low, high = self.minimum, self.maximum
-        if (low is not None and number < low) or (high is not None and number > high):
-            span = f"{'' if low is None else f'{low:g}'}–{'' if high is None else f'{high:g}'}"
-            raise ValueError(f"{self.command} takes {span}, got {number:g}")
+        low = -math.inf if self.minimum is None else self.minimum
+        high = math.inf if self.maximum is None else self.maximum
+        if not low <= number <= high:
+            raise ValueError(f"{self.command} takes {_span(low, high)}, got {number:g}")
         return (*self.before, int(number) if self.decimals == 0 else number)
 
     def level(self, reading: Value) -> int | None:
@@ -110,6 +110,14 @@ class PlayedPin(BaseModel):
         if self.on is not None:
             return int(reading in self.on)
         return None if isinstance(reading, str) else int(reading > self.above)
+
+
+def _span(low: float, high: float) -> str:
+    if low == -math.inf:
+        return f"at most {high:g}"
+    if high == math.inf:
+        return f"at least {low:g}"
+    return f"{low:g} to {high:g}" if low < 0 else f"{low:g}–{high:g}"
 
 
 class FirmataMap(PersonaOptions):

@@ -56,6 +56,8 @@ from psiu_broker.profiles.rarely import Rarely
 
 VERSION: Final = (2, 5)
 SAMPLING_S: Final = 0.019
+BOOT_S: Final = 0.25
+"""After opening a port libraries set it up and throw away what has come; real boards take longer to boot."""
 COMPLAINTS_AT_ONCE: Final = 3
 COMPLAIN_EVERY_S: Final = 1.0
 """In the long run, about one pin: a program may write it a hundred times a second."""
@@ -106,6 +108,7 @@ class FirmataPersona(Persona):
         self._id = options.id
         self._layout = Layout(options)
         self._rarely = Rarely()
+        self._boots_at: float | None = None
         self._shared = Counter(pin.command for pin in self._layout.pins.values())
         self._numbers_of: dict[str, list[int]] = defaultdict(list)
         self._polls: dict[tuple[str, tuple[Value, ...]], _Poll] = {}
@@ -126,9 +129,10 @@ class FirmataPersona(Persona):
         """The mask last reported of each port that is reported; -1: none yet."""
 
     def opened(self, now: float) -> Sequence[Say | Call]:
-        """What a board says after a reset, which opening its port is."""
+        """Opening its port resets a board, which then tells its versions by itself."""
         self._begin()
-        return [_say(Version(*VERSION)), self._firmware()]
+        self._boots_at = now + BOOT_S
+        return []
 
     def heard(self, frame: Frame, now: float) -> Sequence[Say | Call]:
         match read(frame.payload):
@@ -176,10 +180,15 @@ class FirmataPersona(Persona):
     def waits_until(self) -> float | None:
         times = [poll.at for poll in self._polls.values() if self._is_wanted(poll)]
         times += [state.reported_at + self._sampling_s for state in self._states.values() if state.pending]
+        if self._boots_at is not None:
+            times.append(self._boots_at)
         return min(times, default=None)
 
     def due(self, now: float) -> Sequence[Say | Call]:
         actions: Actions = []
+        if self._boots_at is not None and self._boots_at <= now:
+            self._boots_at = None
+            actions += [_say(Version(*VERSION)), self._firmware()]
         for (command, parameters), poll in self._polls.items():
             if self._is_wanted(poll) and poll.at <= now:
                 poll.under_way = True

@@ -105,10 +105,15 @@ def board() -> Board:
 
 
 class TestForItself:
-    def test_it_greets_as_a_board_does_that_was_reset(self, board: Board) -> None:
-        assert b"".join(say.payload for say in board.persona.opened(0.0) if isinstance(say, Say)) == (
+    def test_it_greets_as_a_board_does_that_was_reset_once_the_program_has_set_up_its_port(self, board: Board) -> None:
+        assert board.persona.opened(100.0) == []
+        assert board.persona.waits_until() == pytest.approx(100.25)
+        assert board.persona.due(100.2) == []
+        said = board.persona.due(100.25)
+        assert b"".join(say.payload for say in said if isinstance(say, Say)) == (
             b"\xf9\x02\x05\xf0\x79\x02\x05M\0N\0E\0R\0I\0M\0\xf7"
         )
+        assert board.persona.waits_until() is None
 
     def test_it_tells_its_versions_and_the_name_of_the_robot(self, board: Board) -> None:
         assert board.hears(ASK_VERSION_MESSAGE) == [Version(2, 5)]
@@ -174,7 +179,19 @@ class TestWriting:
         assert board.hears(AskPinState(10)) == [PinState(10, MODES["servo"], 0)]
 
     def test_a_value_out_of_range_is_refused_with_the_range(self, board: Board) -> None:
-        assert board.hears(AnalogMessage(9, 170)) == [Text("garra takes -45–45, got 80")]
+        assert board.hears(AnalogMessage(9, 170)) == [Text("garra takes -45 to 45, got 80")]
+
+    @pytest.mark.parametrize(
+        ("limits", "takes"),
+        [
+            ({"minimum": 100}, "at least 100"),
+            ({"maximum": 20}, "at most 20"),
+            ({"minimum": 10, "maximum": 20}, "10–20"),
+        ],
+    )
+    def test_a_range_may_be_open_at_one_end(self, limits: dict[str, object], takes: str) -> None:
+        board = Board({"9": {"command": "x", "mode": "servo", **limits}})
+        assert board.hears(AnalogMessage(9, 90)) == [Text(f"x takes {takes}, got 90")]
 
     def test_a_level_is_scaled_as_declared(self, board: Board) -> None:
         assert board.hears(PinMode(3, MODES["pwm"]), AnalogMessage(3, 200)) == [Call("roda", (100,), newest=True)]
