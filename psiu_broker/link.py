@@ -17,7 +17,7 @@ from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration
 from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
-from psiu_broker.frame import Address, Frame, Malformed, Way
+from psiu_broker.frame import NOBODY, Address, Frame, Malformed, Way
 from psiu_broker.kept import FIRST_PAUSE_S, Kept
 from psiu_broker.routing.askers import Askers
 from psiu_broker.routing.outbox import Fate, Outbox, Parcel, lane
@@ -243,8 +243,8 @@ class Link(Kept):
         """`frame` of a link whose packets do not say for whom they are: for who asked last, if anybody did."""
         ends = self._ends_named
         if ends is not None:
-            frame = ends.named(frame, way.peer)
-            if ends.plays or frame.destination != ends.own:
+            signed, frame = frame.source != NOBODY, ends.named(frame, way.peer)
+            if ends.plays or signed or frame.destination.is_numbered:
                 return frame
         asker = self._askers.of(frame.source, now) if self._askers is not None else None
         return frame if asker is None else frame._replace(destination=asker)

@@ -262,3 +262,24 @@ async def test_a_robot_is_found_where_the_link_is_its_only_name(tmp_path: Path) 
         answer = await made.call("corpo", "drive", 10)
         assert answer is not None
         assert answer.status == "sucesso"
+
+
+@pytest.mark.parametrize("answers_to", ["base", "PC"])
+async def test_a_robot_of_the_first_draft_is_called_whomever_it_answers(tmp_path: Path, answers_to: str) -> None:
+    robot = AsciiRobot("VELHO", version="0", telemetry_to=answers_to, per_unit_s=0.0)
+    port = PtyPort(robot, link=tmp_path / "radio")
+    text = link("radio", port.path, "psiu-ascii", 'version = "0"') + '[robots.VELHO]\nlink = "radio"\n'
+    async with lab(tmp_path, text, port) as made:
+        answer = await made.call("VELHO", "parafrente", 100)
+        assert answer is not None
+        assert answer.status == "sucesso"
+        assert robot.position.x == 100
+
+
+async def test_a_robot_of_the_second_draft_is_called(tmp_path: Path) -> None:
+    robot = AsciiRobot("MEIO", version="0.5", per_unit_s=0.0)
+    port = PtyPort(robot, link=tmp_path / "radio")
+    async with lab(tmp_path, link("radio", port.path, "psiu-ascii", 'version = "0.5"'), port) as made:
+        answer = await made.call("MEIO", "giradireita", 90)
+        assert answer is not None
+        assert answer.status == "sucesso"

@@ -7,6 +7,7 @@ from ipaddress import ip_address
 from typing import Final
 
 from psiu_broker.adapter import Adapter, Peer
+from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.codecs.soccer import Soccer, rate_trouble
 from psiu_broker.config.problems import Key, Problems, got, suggestion
@@ -145,8 +146,8 @@ def check_ends(
     """Where packets name nobody, each far end is one robot; or a program, and then it is told of one that there is."""
     there: dict[tuple[str, Peer], str] = {}
     for robot in robots.values():
-        link, protocol = links[robot.link], PROTOCOLS[robot.protocol]
-        if protocol.codec.addressed:
+        link = links[robot.link]
+        if _is_addressed(link):
             continue
         if link.options.plays is not None:
             text = f"programs are at the far end of {link.name}, which plays {link.options.plays}; choose another link"
@@ -160,12 +161,16 @@ def check_ends(
             _check_played(link, link.options.plays, robots, problems)
 
 
+def _is_addressed(link: LinkConfiguration) -> bool:
+    return PROTOCOLS[link.protocol].codec(link.codec, Directory()).addressed
+
+
 def _check_played(
     link: LinkConfiguration, plays: str, robots: Mapping[str, RobotConfiguration], problems: Problems
 ) -> None:
     key = ("links", link.name, "plays")
     protocol = PROTOCOLS[link.protocol]
-    if protocol.codec.addressed:
+    if _is_addressed(link):
         problems.add(key, f"is not for {link.protocol}, whose programs name the robots themselves; remove it")
     elif plays not in robots:
         known = suggestion(plays, robots) if robots else "add [robots.NAME]"
