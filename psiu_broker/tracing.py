@@ -4,15 +4,19 @@ import time
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
+from psiu_broker.codecs import psiu_ascii
 from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import MESH, Address
 from psiu_broker.mesh.probe import Probed, Stamp, journey
 from psiu_broker.messages import Answer, CallRequest, Trace, TraceHop
+from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.routing.router import SELF
 
 ASK_S: Final = 5.0
 """How long the robot may take."""
+NOTHING: Final = "nothing"
+"""In the place of the question where there is none."""
 PROBE_S: Final = ASK_S + 2.0
 """How long another broker may take to tell of it."""
 
@@ -56,7 +60,7 @@ class Tracing:
                 probed, stamps = await probe(owner, b, PROBE_S)
             except BusError as error:
                 took_ms = self._ms_since(begun)
-                probed = Probed(question=_question(route.protocol), answered=False, reason=str(error), took_ms=took_ms)
+                probed = Probed(question=_harmless(route.protocol) or NOTHING, answered=False, reason=str(error), took_ms=took_ms)
                 hops = [TraceHop(at=self._own, event="sent", elapsed_ms=0)]
             else:
                 hops = journey(self._own, owner, probed, stamps, self._ms_since(begun), self._broker_of)
@@ -74,9 +78,12 @@ class Tracing:
         """Ask a robot of this broker, or the broker itself."""
         begun = self._clock()
         route = self._exchange.router.find(robot)
-        question = _question(route.protocol if route is not None and route.way != SELF else "psiu-ascii")
+        harmless = _harmless(route.protocol if route is not None and route.way != SELF else psiu_ascii.PROTOCOL)
+        question = harmless or NOTHING
         hops, reason = [], None
-        if route is not None and route.way.link == MESH:
+        if harmless is None:
+            reason = f"{robot} speaks {route and route.protocol}, in which nothing can be asked without harm"
+        elif route is not None and route.way.link == MESH:
             reason = f"{robot} has just gone to broker {route.way.peer}"
         elif route is None or route.way != SELF:
             try:
@@ -96,5 +103,5 @@ class Tracing:
         return round((self._clock() - begun) * 1000, 3)
 
 
-def _question(protocol: str) -> str:
-    return "ping" if protocol == "psiu-hexa" else "qualseunome"
+def _harmless(protocol: str) -> str | None:
+    return PROTOCOLS[protocol].profile.harmless

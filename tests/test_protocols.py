@@ -38,10 +38,10 @@ async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
 class Lab:
     """A broker with the configuration `text`, which has no head: that is the same for all."""
 
-    def __init__(self, folder: Path, text: str) -> None:
+    def __init__(self, folder: Path, text: str, name: str = "base") -> None:
         self.bus = free_port()
         file = folder / "lab.toml"
-        file.write_text(f'[broker]\nname = "base"\n[zenoh]\nlisten = ["tcp/127.0.0.1:{self.bus}"]\n{text}')
+        file.write_text(f'[broker]\nname = "{name}"\n[zenoh]\nlisten = ["tcp/127.0.0.1:{self.bus}"]\n{text}')
         self.broker = Broker(load(file))
 
     async def call(self, robot: str, command: str, *parameters: int | float | str) -> Answer | None:
@@ -77,8 +77,8 @@ class Lab:
 
 
 @asynccontextmanager
-async def lab(folder: Path, text: str, *ports: PtyPort) -> AsyncIterator[Lab]:
-    made = Lab(folder, text)
+async def lab(folder: Path, text: str, *ports: PtyPort, name: str = "base") -> AsyncIterator[Lab]:
+    made = Lab(folder, text, name)
     for port in ports:
         await port.open()
     await made.broker.start()
@@ -283,3 +283,30 @@ async def test_a_robot_of_the_second_draft_is_called(tmp_path: Path) -> None:
         answer = await made.call("MEIO", "giradireita", 90)
         assert answer is not None
         assert answer.status == "sucesso"
+
+
+async def test_a_trace_never_moves_a_robot_that_cannot_be_asked(tmp_path: Path) -> None:
+    body = MityaBody("MITYA", version="2013")
+    port = PtyPort(body, link=tmp_path / "corpo")
+    text = link("corpo", port.path, "mitya", 'version = "2013"') + '[robots.MITYA]\nlink = "corpo"\n'
+    async with lab(tmp_path, text, port) as made:
+        trace = await made.broker.trace(Address.parse("base"), Address.parse("MITYA"))
+        assert trace is not None
+        assert (trace.answered, trace.question) == (False, "nothing")
+        assert trace.reason == "MITYA speaks mitya, in which nothing can be asked without harm"
+
+
+async def test_a_program_in_words_at_one_broker_moves_a_mitya_at_another(tmp_path: Path) -> None:
+    body, pc = MityaBody("MITYA", version="2013"), AsciiRobot("PC")
+    (tmp_path / "b").mkdir()
+    corpo = PtyPort(body, link=tmp_path / "corpo")
+    said: list[bytes] = []
+    radio = PtyPort(pc, link=tmp_path / "radio", observer=lambda way, data: said.append(data) if way == "in" else None)
+    text = link("corpo", corpo.path, "mitya", 'version = "2013"') + '[robots.MITYA]\nlink = "corpo"\n'
+    async with lab(tmp_path, text, corpo) as there:
+        mesh = f'[mesh]\nconnect = ["tcp/127.0.0.1:{there.bus}"]\n'
+        async with lab(tmp_path / "b", link("radio", radio.path, "psiu-ascii") + mesh, radio, name="other") as here:
+            await until(lambda: here.broker.exchange.router.is_elsewhere(Address.parse("MITYA")))
+            radio.send(message("MITYA", "drive 77", "PC"))
+            await until(lambda: body.body.left == 77)
+            await until(lambda: any(b"drive sucesso MITYA" in each for each in said))

@@ -94,6 +94,7 @@ class FirmataProfile(Profile):
     """A board. What its pins can do it tells itself; until then nothing is refused for that reason."""
 
     protocol = firmata.PROTOCOL
+    harmless = "firmware"
     Options = FirmataOptions
 
     def __init__(self, options: FirmataOptions | None = None, timeout_s: float = 2.0) -> None:

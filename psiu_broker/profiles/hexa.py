@@ -48,6 +48,7 @@ class HexaProfile(Profile):
     """
 
     protocol = "psiu-hexa"
+    harmless = "ping"
     Options = HexaOptions
 
     def __init__(

@@ -114,6 +114,8 @@ class Profile(ABC):
     protocol: ClassVar[str]
     Options: ClassVar[type[RobotOptions]] = RobotOptions
     """What the user may write for such a robot in ``[robots.NAME]``."""
+    harmless: ClassVar[str | None] = None
+    """A command that only asks and that every such robot answers; None where the protocol has none."""
     poll: Request | None = None
     """What asks a robot that said BUSY whether it is free; None where the protocol has no such question."""
 

@@ -146,6 +146,7 @@ class PsiuProfile(Profile):
     """
 
     protocol = "psiu-ascii"
+    harmless = NAME
     Options = PsiuOptions
 
     def __init__(
