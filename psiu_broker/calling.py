@@ -43,6 +43,7 @@ _DROPPED: Final[dict[Verdict, tuple[CallCode, str]]] = {
     "no_route": ("unknown_robot", "nobody knows it"),
     "link_down": ("link_down", "its link is down"),
     "queue_full": ("busy", "the outbox of its link is full"),
+    "superseded": ("expired", "a newer command for it took its place before it was sent"),
     "expired": ("expired", "its link was busy for too long; nothing was sent"),
     "refused": ("refused", "its link cannot carry this"),
     "duplicate": ("refused", "the same frame was just heard from another sender"),

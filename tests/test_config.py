@@ -57,6 +57,19 @@ HEXA = """
     device = "/dev/serial/by-id/hexa"
     protocol = "psiu-hexa"
 """
+CORPO = """
+    [links.corpo]
+    adapter = "serial"
+    device = "/dev/serial/by-id/corpo"
+    protocol = "mitya"
+"""
+CAMPO = """
+    [links.campo]
+    adapter = "serial"
+    device = "/dev/serial/by-id/campo"
+    baudrate = 19200
+    protocol = "soccer"
+"""
 ARM = HEXA.replace("links.hexa", "links.arm").replace("by-id/hexa", "by-id/arm") + 'topology = "point-to-point"\n'
 WIFI = """
     [links.wifi]
@@ -257,15 +270,15 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         ('[links.radio]\nadapter="serial"\nprotocol="psiu-ascii"', "links.radio.device: missing; write device = … ("),
         (
             RADIO.replace('"serial"', '"seral"'),
-            'links.radio.adapter: expected one of rfcomm, serial, udp, got "seral"; did you mean serial?',
+            'links.radio.adapter: expected one of pty, rfcomm, serial, udp, got "seral"; did you mean serial?',
         ),
         (
             RADIO.replace('adapter = "serial"', ""),
-            "links.radio.adapter: missing; write adapter = … with one of rfcomm, serial, udp",
+            "links.radio.adapter: missing; write adapter = … with one of pty, rfcomm, serial, udp",
         ),
         (
             RADIO.replace('"psiu-ascii"', '"psiu-asci"'),
-            'links.radio.protocol: expected one of psiu-ascii, psiu-hexa, got "psiu-asci"; did you mean psiu-ascii?',
+            'links.radio.protocol: expected one of amarino, firmata, mitya, psiu-ascii, psiu-hexa, soccer, got "psiu-asci"; did you mean psiu-ascii?',
         ),
         ("[links]\nradio = 3", "links.radio: expected a table, got 3; write [links.radio] above its keys"),
         (
@@ -387,7 +400,7 @@ def test_a_robot_s_name_is_not_an_address(problems):
         pytest.param("[trunks]\nhill = 3", "trunks.hill: expected a table, got 3", id="a trunk that is no table"),
         pytest.param(
             HILL.replace("rfcomm", "rfcom"),
-            'trunks.hill.adapter: expected one of rfcomm, serial, udp, got "rfcom"; did you mean rfcomm?',
+            'trunks.hill.adapter: expected one of pty, rfcomm, serial, udp, got "rfcom"; did you mean rfcomm?',
             id="an unknown adapter of a trunk",
         ),
         pytest.param(
@@ -415,7 +428,7 @@ def test_a_robot_s_name_is_not_an_address(problems):
         ),
         pytest.param(
             RADIO + '[robots.A]\nlink="radio"\naddress=1',
-            "robots.A.address: is for psiu-hexa, and link radio speaks psiu-ascii; remove it",
+            "robots.A.address: is for psiu-hexa and soccer, and link radio speaks psiu-ascii; remove it",
             id="an address in PSIU ASCII",
         ),
         pytest.param(
@@ -442,6 +455,51 @@ def test_a_robot_s_name_is_not_an_address(problems):
             WIFI + '[robots.A]\nlink="wifi"\npeer="127.0.0.1:9001"',
             "robots.A.peer: 127.0.0.1:9001 is not among the peers of its link; add it there",
             id="a peer that the link does not have",
+        ),
+        pytest.param(
+            CORPO + '[robots.A]\nlink="corpo"\n[robots.B]\nlink="corpo"',
+            "robots.B.link: A is there already, and mitya names no robot; give B a link of its own",
+            id="two robots where packets name nobody",
+        ),
+        pytest.param(
+            CORPO + 'plays = "A"\n[robots.A]\nlink="corpo"',
+            "robots.A.link: programs are at the far end of corpo, which plays A; choose another link",
+            id="a robot where a program is",
+        ),
+        pytest.param(
+            CORPO + 'plays = "MNERIM"\n' + RADIO + '[robots.MNERIMM]\nlink="radio"',
+            'links.corpo.plays: there is no robot "MNERIM" in this file; did you mean MNERIMM?',
+            id="a robot that is not there is played",
+        ),
+        pytest.param(
+            RADIO + 'plays = "A"\n[robots.A]\nlink="radio"',
+            "links.radio.plays: is not for psiu-ascii, whose programs name the robots themselves; remove it",
+            id="a robot is played where all of them are found by name",
+        ),
+        pytest.param(
+            CORPO + 'map.Q = { command = "parafrente" }\nplays = "A"\n' + RADIO + '[robots.A]\nlink="radio"',
+            "links.corpo.map: Q is no letter of a Robot Mitya",
+            id="a map of letters that there are not",
+        ),
+        pytest.param(
+            CAMPO + "rate_hz = 300",
+            "links.campo.rate_hz: 300 packets/s × 8 bytes × 10 bits = 24000 bit/s, the line carries 19200;",
+            id="a rate that the line cannot carry",
+        ),
+        pytest.param(
+            CAMPO.replace("19200", "9600"),
+            "links.campo.baudrate: the robots of mirosot listen at 19200; write baudrate = 19200, or baud = 9600",
+            id="a line that is slower than its robots",
+        ),
+        pytest.param(
+            CAMPO + '[robots.A]\nlink="campo"\naddress=4',
+            "robots.A.address: got 4; link campo speaks soccer, whose robots are numbers 1–3",
+            id="a robot that no packet has",
+        ),
+        pytest.param(
+            CAMPO + '[robots.A]\nlink="campo"\naddress=1\nstop="0x03"',
+            "robots.A: stop",
+            id="a stop that does not fit the packet",
         ),
         pytest.param(
             RADIO + '[robots.A]\nlink="radio"\npeer="anything"',

@@ -191,7 +191,7 @@ async def test_robots_of_a_team_are_told_their_wheels_in_packets_that_all_of_the
     team = [SoccerRobot(number) for number in (1, 2, 3)]
     port = PtyPort(*team, link=tmp_path / "campo")
     text = (
-        link("campo", port.path, "soccer", 'preset = "mirosot"\nrate_hz = 30')
+        link("campo", port.path, "soccer", 'preset = "mirosot"\nrate_hz = 30\nbaud = 115200')
         + '[robots.GOLEIRO]\nlink = "campo"\naddress = 1\n'
         + '[robots.ATACANTE]\nlink = "campo"\naddress = 3\nhold_s = 0.2\n'
     )

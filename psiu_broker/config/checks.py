@@ -112,7 +112,11 @@ def check_far_end(
 
 
 def check_rate(adapter: Adapter, codec: Soccer.Options, key: Key, problems: Problems) -> None:
-    """The line carries so many packets a second."""
+    """The line is as fast as its robots listen, and carries so many packets a second."""
+    bits_per_second = adapter.bits_per_second
+    if bits_per_second is not None and bits_per_second != codec.baud:
+        text = f"the robots of {codec.preset} listen at {codec.baud}; write baudrate = {codec.baud}"
+        problems.add((*key, "baudrate"), f"{text}, or baud = {bits_per_second} if yours do at that")
     trouble = rate_trouble(codec, adapter.bits_per_second)
     if trouble is not None:
         problems.add((*key, "rate_hz"), trouble)
