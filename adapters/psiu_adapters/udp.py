@@ -33,6 +33,8 @@ from psiu_broker.errors import LinkAbsent, LinkError, LinkLost
 DATAGRAM_BYTES = 2048
 DRAIN_DATAGRAMS = 32
 SWEEPS = 4
+OTHER_PORTS = 256
+"""How many of the ports that peers send from are remembered; the rest are looked up each time."""
 RESOLVE_FIRST_S = 2.0
 RESOLVE_LAST_S = 60.0
 PASSING = {
@@ -71,6 +73,9 @@ class Udp(Adapter):
     learn: bool = Field(default=True, description="also talk with whoever sends to us; false: only with `peers`")
     max_peers: int = Field(default=64, ge=1, description="how many senders are learned; the rest are refused")
     peer_ttl_s: float = Field(default=300.0, ge=1, description="a learned sender silent for so long is forgotten")
+    any_port: bool = Field(
+        default=False, description="peers send from other ports than they listen on: know them by their host alone"
+    )
     reuse: bool = Field(default=False, description="share the port with other programs that do the same")
 
     @field_validator("listen")
@@ -96,6 +101,14 @@ class Udp(Adapter):
                 raise ValueError(
                     f"listen = {self.listen!r} and the peer {peer!r} cannot talk: one IPv4, the other IPv6"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_hosts(self) -> Self:
+        hosts = [split(peer)[0] for peer in self.peers]
+        twice = next((host for host in hosts if hosts.count(host) > 1), None)
+        if self.any_port and twice is not None:
+            raise ValueError(f"any_port knows a peer by its host, and two of them are at {twice}; leave it out")
         return self
 
     @property
@@ -282,11 +295,21 @@ class _UdpTransport(Transport):
         if self._groups and (address in self._own or is_own(self._main, address)):
             self._own.add(address)
             return None
+        entry = self._elsewhere(address) if self._options.any_port else None
+        if entry is not None:
+            return entry
         if not self._options.learn or self._learned >= self._options.max_peers:
             self._refused += 1
             return None
         self._learned += 1
         return self._add(address, fixed=False)
+
+    def _elsewhere(self, address: Address) -> _Entry | None:
+        """The fixed peer at this host, which sends from another port than the one it listens on."""
+        entry = next((each for each in self._by_peer.values() if each.fixed and each.address[0] == address[0]), None)
+        if entry is not None and len(self._by_address) - len(self._by_peer) < OTHER_PORTS:
+            self._by_address[address] = entry
+        return entry
 
     def _add(self, address: Address, *, fixed: bool) -> _Entry:
         entry = self._by_address.get(address)
@@ -340,7 +363,9 @@ class _UdpTransport(Transport):
             return
         self._add_fixed(text, addresses[0])
         if before is not None and before not in self._placed.values():
-            entry = self._by_address.pop(before)
+            entry = self._by_address[before]
+            for address in [address for address, each in self._by_address.items() if each is entry]:
+                del self._by_address[address]
             del self._by_peer[entry.peer]
             self._count_everyone()
             self._receiver.peer_lost(entry.peer)

@@ -139,6 +139,24 @@ class TestPeers:
         assert list(transport.peers) == [fixed.peer]
         await transport.close()
 
+    async def test_a_peer_that_sends_from_another_port_than_it_listens_on_is_known_by_its_host(
+        self, strangers: list[Robot], recorder: Recorder
+    ) -> None:
+        listening, sending, *_ = strangers
+        transport = await open_for(recorder, strangers, learn=False, peers=(listening.text,), any_port=True)
+        await sending.say(b"E0001")
+        await sending.say(b"E0002")
+        await recorder.until(lambda: len(recorder.heard) == 2)
+        assert recorder.heard == [(b"E0001", listening.peer), (b"E0002", listening.peer)]
+        assert list(transport.peers) == [listening.peer]
+        transport.write(b"D0064", recorder.heard[0][1])
+        assert await listening.heard(5) == b"D0064"
+        await transport.close()
+
+    def test_two_peers_of_one_host_cannot_be_known_by_it(self) -> None:
+        with pytest.raises(ValueError, match=r"two of them are at 10\.0\.0\.1"):
+            Udp(listen="0.0.0.0:1", peers=("10.0.0.1:1", "10.0.0.1:2"), any_port=True)
+
     async def test_a_forgotten_peer_makes_room_for_another(self, strangers: list[Robot], recorder: Recorder) -> None:
         transport = await open_for(recorder, strangers, peer_ttl_s=1, max_peers=1)
         await strangers[0].say(b"first")
