@@ -308,6 +308,10 @@ class TraceHop(Message):
     elapsed_ms: float = Field(description="since the question left")
 
 
+NOTHING: Final = "nothing"
+"""What a robot was asked that cannot be asked anything without harm."""
+
+
 class Trace(Message):
     """How a harmless question went from `a` to `b`: ``psiu/@broker/{broker}/trace/{a}/{b}``.
 
@@ -316,7 +320,7 @@ class Trace(Message):
 
     a: str
     b: str
-    question: str
+    question: str = Field(description="the command that was sent; nothing: its protocol has no harmless one")
     answered: bool
     reason: str | None = Field(default=None, description="why there was no answer")
     hops: list[TraceHop] = []

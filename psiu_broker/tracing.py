@@ -9,14 +9,12 @@ from psiu_broker.errors import BusError, CallError
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import MESH, Address
 from psiu_broker.mesh.probe import Probed, Stamp, journey
-from psiu_broker.messages import Answer, CallRequest, Trace, TraceHop
+from psiu_broker.messages import NOTHING, Answer, CallRequest, Trace, TraceHop
 from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.routing.router import SELF
 
 ASK_S: Final = 5.0
 """How long the robot may take."""
-NOTHING: Final = "nothing"
-"""In the place of the question where there is none."""
 PROBE_S: Final = ASK_S + 2.0
 """How long another broker may take to tell of it."""
 
@@ -60,7 +58,8 @@ class Tracing:
                 probed, stamps = await probe(owner, b, PROBE_S)
             except BusError as error:
                 took_ms = self._ms_since(begun)
-                probed = Probed(question=_harmless(route.protocol) or NOTHING, answered=False, reason=str(error), took_ms=took_ms)
+                question = _harmless(route.protocol) or NOTHING
+                probed = Probed(question=question, answered=False, reason=str(error), took_ms=took_ms)
                 hops = [TraceHop(at=self._own, event="sent", elapsed_ms=0)]
             else:
                 hops = journey(self._own, owner, probed, stamps, self._ms_since(begun), self._broker_of)

@@ -18,7 +18,7 @@ from psiu_broker.cli.output import (
     styled,
 )
 from psiu_broker.frame import MESH
-from psiu_broker.messages import Trace, Why
+from psiu_broker.messages import NOTHING, Trace, Why
 
 TRACE_TIMEOUT_S: Final = 15.0
 """More than a broker takes for a trace."""
@@ -109,7 +109,9 @@ def trace(connection: Connection, a: str, b: str) -> None:
         show_trace(each, drawn=on_terminal())
     silent = next((each for each in traces if not each.answered), None)
     if silent is not None:
-        raise NoWay(f"{silent.b} did not answer {silent.question}: {silent.reason or 'it was silent'}")
+        reason = silent.reason or "it was silent"
+        told = "nothing was sent" if silent.question == NOTHING else f"{silent.b} did not answer {silent.question}"
+        raise NoWay(f"{told}: {reason}")
 
 
 def followed(decisions: Mapping[str, Why], begin: str | None = None) -> Path:

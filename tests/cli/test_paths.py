@@ -9,7 +9,7 @@ from click.testing import Result
 
 from psiu_broker.cli import connection, paths
 from psiu_broker.cli.paths import followed
-from psiu_broker.messages import Trace, TraceHop, Why
+from psiu_broker.messages import NOTHING, Trace, TraceHop, Why
 
 Run = Callable[..., Result]
 
@@ -186,6 +186,9 @@ def test_silence_exits_3_after_the_way_so_far(bus: Bus, tool: Run) -> None:
     shown = tool("trace", "BETA", "MNERIM")
     assert (shown.exit_code, len(shown.stdout.splitlines())) == (3, 2)
     assert shown.stderr == "psiu: MNERIM did not answer qualseunome: silent after 3 tries\n"
+    unasked = silent.model_copy(update={"question": NOTHING, "reason": "MNERIM speaks mitya"})
+    bus.answers = {"north": unasked.model_dump(mode="json")}
+    assert tool("trace", "BETA", "MNERIM").stderr == "psiu: nothing was sent: MNERIM speaks mitya\n"
 
 
 def test_a_robot_on_no_broker_is_told_apart_from_no_broker(bus: Bus, tool: Run) -> None:
