@@ -74,6 +74,7 @@ class Calling:
         self._clock = clock
         self._profiles: dict[Address, Profile] = {}
         self._searches: dict[Address, _Search] = {}
+        self._ungreeted: set[Address] = set()
         self.settling_s: Callable[[], float] = lambda: 0.0
         """How long another broker may take to say that it heard a robot, too, that was searched for."""
 
@@ -133,24 +134,30 @@ class Calling:
         if told is not None and route.protocol != psiu_ascii.PROTOCOL:
             return told
         options = link.configuration.options
-        return await self.conversations.call(
-            self._robot(route),
-            command,
-            parameters,
-            timeout_s=timeout_s,
-            fresh_s=fresh_s,
-            retries=options.retries,
-            busy_poll_s=options.busy_poll_s,
-        )
+        try:
+            return await self.conversations.call(
+                self._robot(route),
+                command,
+                parameters,
+                timeout_s=timeout_s,
+                fresh_s=fresh_s,
+                retries=options.retries,
+                busy_poll_s=options.busy_poll_s,
+            )
+        finally:
+            if route.robot in self._ungreeted:
+                self.greet(route)
 
     def commands(self, route: Route) -> Sequence[Command]:
         return self._profile(route).commands()
 
     def greet(self, route: Route) -> None:
-        """Tell the robot what its profile greets it with, unless it must hear nothing now."""
+        """Tell the robot what its profile greets it with, but not before it may hear it."""
         robot = self._robot(route)
         if robot.address in self.conversations.alone:
+            self._ungreeted.add(route.robot)
             return
+        self._ungreeted.discard(route.robot)
         for request in robot.profile.greeting():
             self._exchange.send(robot.build(request), self._clock())
 
@@ -187,6 +194,7 @@ class Calling:
 
     def robot_gone(self, route: Route) -> None:
         self._profiles.pop(route.robot, None)
+        self._ungreeted.discard(route.robot)
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self.conversations.undelivered(frame, self._dropped(frame.destination, verdict))

@@ -267,7 +267,7 @@ class Progress:
         if self._terminal:
             line = f"\r{self._robot}: {sent} of {total} messages\x1b[K"
             click.echo(line, nl=False, err=True)
-        elif sent % _SHOWN_EVERY == 0 or sent == total:
+        elif sent % _SHOWN_EVERY == 0:
             print_rows([(sent, total)])
             sys.stdout.flush()
 

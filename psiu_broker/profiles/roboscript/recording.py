@@ -110,9 +110,9 @@ def _ending(version: Version) -> tuple[Step, ...]:
     letters = BY_WORD[version]
     delay, end, stop = (message(letters[word], 0) for word in (WAIT, ROOM, "drive"))
     return (
-        Step(SCRIPT + WAIT, delay, "end"),
-        Step(SCRIPT + WAIT, delay, "end"),
-        Step(SCRIPT + ROOM, end, "end"),
+        Step(WAIT, delay, "end"),
+        Step(WAIT, delay, "end"),
+        Step(ROOM, end, "end"),
         Step("drive", stop, "end"),
     )
 
