@@ -163,6 +163,17 @@ def test_a_command_crosses_from_udp_to_a_radio_unchanged(world: World) -> None:
     world.balances()
 
 
+def test_a_robot_that_must_be_left_alone_hears_the_broker_and_nobody_else(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.exchange.alone = {Address.named("MNERIM")}
+    world.links["wifi"].received(wire("PC", "MNERIM", "parafrente", "100"), PEERS[0])
+    assert world.wires("radio") == []
+    assert world.verdicts("wifi") == {"refused": 1}
+    ours = psiu_ascii.message(BASE, Address.named("MNERIM"), "quantoscomandos")
+    assert world.exchange.send(ours, world.now) == "delivered"
+    world.balances()
+
+
 def test_a_frame_with_a_wrong_size_is_forwarded_with_the_true_one(world: World) -> None:
     world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
     world.links["wifi"].received(b"MNERIM 131 parafrente 100 PC 02121", PEERS[0])

@@ -191,6 +191,22 @@ async def test_monitor_tells_puts_and_deletes(client: Client, connect: Callable[
     await asyncio.to_thread(heard.close)
 
 
+async def test_a_listener_is_handed_what_is_put_until_it_ends(
+    client: Client, connect: Callable[[], zenoh.Session]
+) -> None:
+    heard: list[bytes] = []
+    other = connect()
+    with client.listening("psiu/*/B/**", heard.append):
+        async with asyncio.timeout(5):
+            while not heard:  # until the subscription has come through
+                other.put("psiu/A/B/c", b"1")
+                other.put("psiu/A/C/c", b"2")
+                await asyncio.sleep(0.01)
+    assert set(heard) == {b"1"}
+    with pytest.raises(BusError), client.listening("psiu/#", heard.append):
+        pass
+
+
 async def test_ctrl_c_ends_a_monitor(endpoint: str, session: Session) -> None:
     script = f"""
 from psiu_broker.bus.client import Client
