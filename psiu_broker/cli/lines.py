@@ -12,9 +12,11 @@ _COLOURS = {"sucesso": "green", "falha": "red"}
 
 
 def frame_words(message: Message) -> str:
-    """What a `Decoded` says: ``parafrente 100``, ``garra 45 deg (node 4, signal 64)``, ``ack``."""
+    """What a `Decoded` says: ``parafrente 100``, ``garra 45 deg (node 4, signal 64)``, ``battery=5.02 V``, ``ack``."""
     kind = str(message.get("kind"))
     words: list[object] = [message.get("command") or kind]
+    readings = message.get("readings") or {}
+    parameters = [*(message.get("parameters") or ())]
     if kind == "node":
         node, signal = message.get("node"), message.get("signal")
         if message.get("command") is None:
@@ -23,7 +25,18 @@ def frame_words(message: Message) -> str:
             words += [f"{message['value']:g}", message.get("unit") or "", f"(node {node}, signal {signal})"]
         else:
             words += [f"(node {node}, signal {signal})"]
-    words += [message.get("status") or "", *(message.get("parameters") or ()), *(message.get("fields") or ())]
+    elif readings:
+        names = list(readings)
+        # A reading that is called like the message, or that its parameters repeat, is said once.
+        words = [] if names == words else words
+        parameters = []
+        words += [f"{name}={value}" for name, value in readings.items()]
+        words.append(message.get("unit") or "")
+    elif parameters:
+        parameters.append(message.get("unit") or "")
+    elif message.get("value") is not None:
+        words += [f"{message['value']:g}", message.get("unit") or ""]
+    words += [message.get("status") or "", *parameters, *(message.get("fields") or ())]
     text = " ".join(str(word) for word in words if word != "")
     return f"{text} [{message['remark']}]" if message.get("remark") else text
 

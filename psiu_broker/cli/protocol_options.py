@@ -1,71 +1,72 @@
 """The options of the codecs as options of a command, so that both have the same names, values and words."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final, Literal, TypeVar, get_args, get_origin
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal, get_args, get_origin
 
 import click
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from psiu_broker.cli.by_protocol import Offer, Offers, of_protocol, offered, spelling
 from psiu_broker.cli.commands import number, parsed
-from psiu_broker.protocols import CODECS
+from psiu_broker.protocols import CODECS, PROTOCOLS
 
-Command = TypeVar("Command", bound=Callable[..., Any])
-
-_WITHOUT: Final = frozenset({"silence_ms"})
-"""What means nothing to bytes that are all there."""
-
-
-def protocol_options(command: Command) -> Command:
-    """Give `command` an option for each that a codec has; None where the user gives none."""
-    fields: dict[str, FieldInfo] = {}
-    owners: dict[str, list[str]] = {}
-    for protocol, codec in CODECS.items():
-        for name, field in codec.Options.model_fields.items():
-            if name not in _WITHOUT:
-                fields.setdefault(name, field)
-                owners.setdefault(name, []).append(protocol)
-    for name, field in reversed(fields.items()):
-        command = _option(name, field, " and ".join(owners[name]))(command)
-    return command
-
-
-def given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a command's `options` that belong to codecs and were given."""
-    known = {name for codec in CODECS.values() for name in codec.Options.model_fields}
-    return {name: value for name, value in options.items() if name in known and value is not None}
+_WITHOUT: Final = frozenset({"silence_ms", "realign", "baud", "rate_hz", "hold_s", "steady", "buffer"})
+"""What means nothing to bytes that are all there, or to those that nobody sends."""
+_SIMPLE: Final = (bool, int, float, str)
 
 
 def codec_options(protocol: str, options: Mapping[str, Any]) -> BaseModel:
-    """What a codec of `protocol` is made of; a usage error for an option that is another's or has a wrong value."""
-    model = CODECS[protocol].Options
-    for name in options:
-        if name not in model.model_fields:
-            owner = next(other for other, codec in CODECS.items() if name in codec.Options.model_fields)
-            raise click.UsageError(f"{_spelled(name)} is an option of {owner}; add --protocol {owner}")
+    """What a codec of `protocol` is made of, from a command's `options`.
+
+    Raises:
+        click.UsageError: an option is another protocol's, or has a wrong value.
+    """
+    return _made(protocol, of_protocol(protocol, options, CODEC_OFFERS))
+
+
+def _made(protocol: str, given: Mapping[str, Any]) -> BaseModel:
     try:
-        return model.model_validate(options)
+        return CODECS[protocol].Options.model_validate(given)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise click.UsageError(f"{_spelled(str(first['loc'][0]))}: {first['msg']}, not {first['input']!r}") from error
+        where, said = spelling(str(next(iter(first["loc"]), ""))), first["msg"].removeprefix("Value error, ")
+        shown = "" if where == "--" or first["type"] == "value_error" else f", not {first['input']!r}"
+        raise click.UsageError(f"{said}{shown}" if where == "--" else f"{where}: {said}{shown}") from error
 
 
-def _option(name: str, field: FieldInfo, owner: str) -> Callable[[Command], Command]:
+def _offers(protocol: str) -> Sequence[Offer]:
+    fields = CODECS[protocol].Options.model_fields
+    return [_offer(name, field) for name, field in fields.items() if name not in _WITHOUT and _is_simple(field)]
+
+
+def _is_simple(field: FieldInfo) -> bool:
+    """Whether it is one word; lists and tables are for the configuration."""
     kind: Any = field.annotation
-    spelled = _spelled(name)
-    declaration = f"{spelled}/--no-{spelled[2:]}" if kind is bool else spelled
-    more: dict[str, Any] = {}
-    if get_origin(kind) is Literal:
-        more = {"type": click.Choice(get_args(kind))}
+    return get_origin(kind) is Literal or kind in _SIMPLE or any(each in _SIMPLE for each in get_args(kind))
+
+
+def _offer(name: str, field: FieldInfo) -> Offer:
+    kind: Any = field.annotation
+    spelled = spelling(name)
+    settings: dict[str, Any] = {}
+    if kind is bool:
+        spelled = f"{spelled}/--no-{spelled[2:]}"
+    elif get_origin(kind) is Literal:
+        settings = {"type": click.Choice(get_args(kind))}
     elif kind is int or int in get_args(kind):
-        more = {"metavar": "NUMBER", "callback": parsed(number)}
+        settings = {"metavar": "NUMBER", "callback": parsed(number)}
+    elif kind is float or float in get_args(kind):
+        settings = {"metavar": "NUMBER", "type": float}
     default = "" if field.default is None or field.default == "" else f"; usual: {_shown(field.default)}"
-    return click.option(declaration, name, default=None, help=f"{owner}: {field.description}{default}.", **more)
+    return Offer(name, f"{field.description}{default}.", spelled=spelled, **settings)
 
 
 def _shown(default: Any) -> str:
     return {True: "yes", False: "no"}[default] if isinstance(default, bool) else str(default)
 
 
-def _spelled(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+CODEC_OFFERS: Final[Offers] = {protocol: _offers(protocol) for protocol in PROTOCOLS}
+
+protocol_options: Final = offered(CODEC_OFFERS)
+"""Give a `ByProtocol` an option for each that a codec has."""

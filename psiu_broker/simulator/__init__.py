@@ -7,19 +7,31 @@
 `psiu_broker.simulator.rfcomm` needs the extra ``bluetooth-simulator`` and is imported only on request.
 """
 
+from psiu_broker.simulator.amarino import AmarinoBoard
 from psiu_broker.simulator.ascii import QUIRKS, AsciiRobot, Extra, Position, Quirk
 from psiu_broker.simulator.faults import Faults
+from psiu_broker.simulator.firmata import Drift, FirmataBoard
 from psiu_broker.simulator.hexa import HexaRobot
+from psiu_broker.simulator.mitya import Action, Body, MityaBody, MityaVersion
 from psiu_broker.simulator.robot import Heard, Reply, Robot
+from psiu_broker.simulator.soccer import TEAMS, SoccerRobot
 from psiu_broker.simulator.transports import Port, PtyPort, Simulation, UdpPort
 
 __all__ = [
     "QUIRKS",
+    "TEAMS",
+    "Action",
+    "AmarinoBoard",
     "AsciiRobot",
+    "Body",
+    "Drift",
     "Extra",
     "Faults",
+    "FirmataBoard",
     "Heard",
     "HexaRobot",
+    "MityaBody",
+    "MityaVersion",
     "Port",
     "Position",
     "PtyPort",
@@ -27,5 +39,6 @@ __all__ = [
     "Reply",
     "Robot",
     "Simulation",
+    "SoccerRobot",
     "UdpPort",
 ]

@@ -125,7 +125,7 @@ def test_words_are_encoded_as_the_document_has_them(tool: Run) -> None:
     ("words", "said"),
     [
         (("MNERIM",), "destination and then the command"),
-        (("MNERIM", "parafrente", "--to", "2"), "--to is an option of psiu-hexa"),
+        (("MNERIM", "parafrente", "--to", "2"), "--to is an option of psiu-hexa and soccer; write the destination"),
         (("MNERIM", "parafrente", "--crc", "xor"), "--crc is an option of psiu-hexa"),
         (("--protocol", "psiu-hexa", "ping"), "--to is missing"),
         (("--protocol", "psiu-hexa", "--to", "2", "node", "4"), "expected ping, ack"),
