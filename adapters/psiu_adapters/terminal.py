@@ -1,10 +1,7 @@
 """A pseudo-terminal under a fixed name."""
 
-import array
-import fcntl
 import os
 import select
-import termios
 import time
 import tty
 from contextlib import suppress
@@ -87,17 +84,18 @@ class Terminal:
             slave = os.open(self.name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             try:
                 deadline = time.monotonic() + READ_S
-                while _unread_bytes(slave) and time.monotonic() < deadline:
+                while _is_readable(slave) and time.monotonic() < deadline:
                     time.sleep(READ_S / 20)
             finally:
                 os.close(slave)
         self.remove()
 
 
-def _unread_bytes(slave: int) -> int:
-    count = array.array("i", [0])
-    fcntl.ioctl(slave, termios.FIONREAD, count)
-    return count[0]
+def _is_readable(slave: int) -> bool:
+    # By poll: it brings along what is still on its way from the master, which counting the bytes would not see.
+    poll = select.poll()
+    poll.register(slave, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def _target(path: Path) -> str:

@@ -56,7 +56,7 @@ class Program(FarEnd):
         async with asyncio.timeout(PATIENCE_S):
             while len(data) < size:
                 try:
-                    data += os.read(self.fd, size - len(data))
+                    data += os.read(self.fd, size - len(data)) or pytest.fail("hung up")
                 except BlockingIOError:
                     await asyncio.sleep(0.001)
         return data
@@ -214,7 +214,7 @@ class TestComingAndGoing:
         await recorder.until(lambda: recorder.gone)
         before = time.process_time()
         await asyncio.sleep(0.3)
-        assert time.process_time() - before < 0.1
+        assert time.process_time() - before < 0.15
         await transport.close()
 
     async def test_programs_without_number_leave_no_descriptor(self, far: Program, recorder: Recorder) -> None:
@@ -282,10 +282,10 @@ class TestName:
             far.path.mkdir()
         else:
             far.path.symlink_to("/dev/ttyUSB0")
-        before = far.path.lstat()
+        before = far.path.lstat()[:7]
         with pytest.raises(LinkBusy, match="remove it or choose another name"):
             await far.adapter.open(recorder)
-        assert far.path.lstat() == before
+        assert far.path.lstat()[:7] == before
         assert list(far.path.parent.iterdir()) == [far.path]
 
     async def test_a_name_that_somebody_took_over_is_left_to_them(self, far: Program, recorder: Recorder) -> None:
