@@ -31,6 +31,8 @@ _timeout = click.option(
     epilog=examples(
         "psiu call MNERIM parafrente 100",
         "psiu call BRACO garra -45 --timeout 5",
+        "psiu call MITYA D -100",
+        "psiu call GOLEIRO rodas 15 -31",
         "psiu call MNERIM quantoscomandos --json",
         "psiu call 0x12 ping && echo it is there",
     ),
@@ -45,11 +47,13 @@ def call(
 ) -> None:
     """Tell ROBOT a COMMAND and wait for its answer.
 
-    What reads as a number is sent as one. ROBOT is a name, or a PSIU HEXA address such as 0x12.
+    What reads as a number is sent as one. ROBOT is a name, or a PSIU HEXA address such as 0x12. What it understands is
+    listed by psiu robots ROBOT.
 
     The exit code is 0 for sucesso or a value, 1 for falha, 3 if there was no way to the robot or no answer; then one
-    line on stderr says why. With --json: an answer (psiu schema Answer), or a refusal (psiu schema Refusal) whose
-    error is also no_broker where not even a broker answered.
+    line on stderr says why. It is 0 as well where the robot's protocol has no answers and the command was sent. With
+    --json: an answer (psiu schema Answer), or a refusal (psiu schema Refusal) whose error is also no_broker where not
+    even a broker answered.
     """
     with connection.client() as client:
         answer = client.call(robot, command, _request(parameters, timeout_s))
@@ -106,11 +110,14 @@ def discover(connection: Connection) -> None:
 
 
 def answer_line(robot: str, answer: Answer) -> str:
-    """``MNERIM: sucesso (2.1 ms)``, ``BRACO: 42 cm (3.0 ms)``."""
-    words = [answer.status, *answer.values, answer.unit if answer.values else None]
-    said = " ".join(str(word) for word in words if word is not None) or "answered"
+    """``MNERIM: sucesso (2.1 ms)``, ``BRACO: 42 cm (3.0 ms)``, ``MITYA: sent; this robot does not answer (301 ms)``."""
+    values = () if answer.status == "falha" and answer.remark else answer.values  # the remark says them in words
+    words = [answer.status, *values, answer.unit if values else None]
+    said = " ".join(str(word) for word in words if word is not None)
+    if answer.remark:
+        said = f"{said}: {answer.remark}" if said else answer.remark
     colour = {"sucesso": "green", "falha": "red"}.get(answer.status or "")
-    return f"{printable(robot)}: {styled(said, fg=colour, bold=True)} ({answer.elapsed_ms:.1f} ms)"
+    return f"{printable(robot)}: {styled(said or 'answered', fg=colour, bold=True)} ({answer.elapsed_ms:.1f} ms)"
 
 
 def _request(parameters: tuple[str, ...], timeout_s: float | None = None) -> CallRequest:

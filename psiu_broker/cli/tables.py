@@ -18,7 +18,7 @@ from psiu_broker.cli.output import (
     printable,
     styled,
 )
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Route, Status, Trunk
+from psiu_broker.messages import Account, Card, Command, Health, Ledger, Link, Route, Status, Trunk
 from psiu_broker.profiles.psiu import QUESTIONS
 
 Told = Sequence[tuple[str, Any]]
@@ -30,19 +30,33 @@ Ledgers = Sequence[tuple[str, Ledger]]
 Rows = Sequence[tuple[str, Sequence[Cell]]]
 
 
-@click.command(epilog=examples("psiu robots", "psiu robots --json | jq '.[].robot'", "psiu robots | cut -f1"))
+@click.command(
+    epilog=examples("psiu robots", "psiu robots MITYA", "psiu robots --json | jq '.[].robot'", "psiu robots | cut -f1")
+)
+@click.argument("robot", required=False)
 @connects
-def robots(connection: Connection) -> None:
+def robots(connection: Connection, robot: str | None) -> None:
     """List the robots that the broker knows, where they are and what they can do.
 
     In a pipe each line has, between tabs: robot, address, protocol, link, peer, link state, last heard, frames
     heard, commands, broker. With --json: a list of cards (psiu schema Card).
+
+    With a ROBOT, by name or address: its commands, what they take and what they do. In a pipe each line then has:
+    command, other names, ints, floats, chars, minimum, maximum, unit, description. With --json: its card.
     """
     with connection.client() as client:
         cards = client.cards()
         if not cards and not client.brokers():
             raise connection.nobody()
-    if connection.as_json:
+    if robot is not None:
+        card = next((card for card in cards if robot in (card.robot, card.address)), None)
+        if card is None:
+            raise connection.failure("unknown_robot", f"no robot {robot} is known; ask who is there: psiu discover")
+        if connection.as_json:
+            print_json(card.model_dump(mode="json"))
+        else:
+            show_commands(card, drawn=on_terminal())
+    elif connection.as_json:
         print_models(cards)
     else:
         show_robots(cards, drawn=on_terminal())
@@ -135,6 +149,43 @@ def show_robots(cards: Sequence[Card], *, drawn: bool) -> None:
          " ".join(command.name for command in c.commands), c.broker)
         for c in cards
     )  # fmt: skip
+
+
+def show_commands(card: Card, *, drawn: bool) -> None:
+    """What one robot can be told."""
+    if not drawn:
+        print_rows(
+            (c.name, " ".join(c.aliases), c.ints, c.floats, c.chars, c.minimum, c.maximum, c.unit, c.description)
+            for c in card.commands
+        )
+        return
+    name, protocol, where, state, _, _ = _robot(card)
+    click.echo(f"{styled(str(name), bold=True)}  {printable(f'{protocol} on {where} ({state})')}")
+    heads = ("command", "also", "takes", "what it does")
+    rows = [(c.name, " ".join(c.aliases), takes(c), c.description or _told_in(c)) for c in card.commands]
+    print_table(heads, rows, "It has told no commands yet. Ask it what it can do: psiu discover")
+
+
+def takes(command: Command) -> str | None:
+    """The parameters of a command for a person: ``-31 to 31, twice``, ``0 to 180 deg``, ``text``; None for none."""
+    count = command.ints + command.floats
+    span = _span(command.minimum, command.maximum)
+    several = {0: "or nothing", 1: "", 2: "twice"}.get(count, f"{count} times")
+    numbers = " ".join(filter(None, (span or ("a number" if count else ""), command.unit if span or count else "")))
+    if numbers and several:
+        numbers = f"{numbers}, {several}"
+    texts = {0: "", 1: "text"}.get(command.chars, f"{command.chars} texts")
+    return " and ".join(filter(None, (numbers, texts))) or None
+
+
+def _told_in(command: Command) -> str | None:
+    return f"answers in {command.unit}" if command.unit and takes(command) is None else None
+
+
+def _span(low: int | None, high: int | None) -> str:
+    if low is None or high is None:
+        return f"from {low}" if low is not None else f"up to {high}" if high is not None else ""
+    return str(low) if low == high else f"{low} to {high}"
 
 
 def show_links(found: Links, *, drawn: bool) -> None:
