@@ -8,7 +8,7 @@ CANDIDATES := $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11
 .PHONY: help demo test bench mesh-proof mesh-scale lint clean
 
 help:
-	@echo "make demo    a broker and three simulated robots, for a look"
+	@echo "make demo    a broker and simulated robots of every protocol, for a look"
 	@echo "make test    all tests"
 	@echo "make bench   the figures of the README"
 	@echo "make mesh-proof   how the mesh heals, as root: EVENTS=100 a network, SEED=1"

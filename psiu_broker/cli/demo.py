@@ -1,4 +1,4 @@
-"""`psiu-broker demo`: a broker, three simulated robots on three real transports, and a program on the bus."""
+"""`psiu-broker demo`: a broker, simulated robots of every protocol on real transports, and a program on the bus."""
 
 import asyncio
 import logging
@@ -24,12 +24,24 @@ from psiu_broker.config import load
 from psiu_broker.errors import PsiuError
 from psiu_broker.messages import Answer, CallRequest, Ledger, Link
 from psiu_broker.resident import DISCOVER
-from psiu_broker.simulator import AsciiRobot, HexaRobot, PtyPort, Simulation, UdpPort
+from psiu_broker.simulator import (
+    AmarinoBoard,
+    AsciiRobot,
+    FirmataBoard,
+    HexaRobot,
+    MityaBody,
+    PtyPort,
+    Robot,
+    Simulation,
+    SoccerRobot,
+    UdpPort,
+)
 
 WHOLE_S: Final = 18.0
 STEP_S: Final = 5.0
 GARRA: Final = 4
 ARM: Final = 0x12
+LED: Final = 13
 
 CONFIGURATION: Final = """\
 [broker]
@@ -56,6 +68,39 @@ topology = "point-to-point"
 address = 0x12
 link = "arm"
 nodes.garra = {{ node = 4, type = "servo" }}
+[links.body]
+adapter = "serial"
+device = "{body}"
+baudrate = 9600
+protocol = "mitya"
+version = "2012"
+[robots.MITYA]
+link = "body"
+[links.field]
+adapter = "serial"
+device = "{field}"
+baudrate = 19200
+protocol = "soccer"
+preset = "mirosot"
+[robots.GOLEIRO]
+link = "field"
+address = 1
+[links.board]
+adapter = "serial"
+device = "{board}"
+baudrate = 57600
+protocol = "firmata"
+[robots.UNO]
+link = "board"
+pins.led = {{ pin = 13, mode = "output" }}
+[links.lamp]
+adapter = "serial"
+device = "{lamp}"
+baudrate = 57600
+protocol = "amarino"
+[robots.LAMPADA]
+link = "lamp"
+commands.brilho = {{ flag = "b", parameters = ["int"], minimum = 0, maximum = 255, answer = true }}
 """
 
 
@@ -65,10 +110,10 @@ class NotAsItShould(Exception):
 
 @click.command(epilog=examples("psiu-broker demo", "psiu-broker demo | cat"))
 def demo() -> None:
-    """See a broker and three simulated robots at work: no hardware needed, some seconds long.
+    """See a broker and simulated robots of every protocol at work: no hardware needed, some seconds long.
 
-    Two pseudo-terminals stand for serial ports, a third robot is on UDP, and a program listens on the bus. The exit
-    code is 0 if all went as told, else 1.
+    Pseudo-terminals stand for serial ports, one robot is on UDP, and a program listens on the bus. The exit code is 0
+    if all went as told, else 1.
     """
     log_to_stderr(logging.WARNING)
     try:
@@ -91,6 +136,7 @@ async def _show() -> None:
             await stage.call()
             await stage.relay()
             await stage.translate()
+            await stage.call_the_others()
             await stage.close_the_books()
     click.echo("")
     took_s = asyncio.get_running_loop().time() - begun
@@ -105,15 +151,23 @@ class Stage:
         self.mnerim = AsciiRobot("MNERIM", per_unit_s=0.002)
         self.beta = AsciiRobot("BETA")
         self.braco = HexaRobot(ARM, topology="point-to-point", actuators=(GARRA,), sensors={})
+        self.mitya = MityaBody()
+        self.team = SoccerRobot.team("mirosot")
+        self.uno = FirmataBoard()
+        self.lampada = AmarinoBoard(functions={"b": ""})
         bus = _free_port(socket.SOCK_STREAM)
         wifi, beta = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
-        self.radio = PtyPort(self.mnerim, link=folder / "radio")
         self.wifi = UdpPort(self.beta, listen=f"127.0.0.1:{beta}")
-        self.arm = PtyPort(self.braco, link=folder / "arm")
+        serial: dict[str, list[Robot]] = {
+            "radio": [self.mnerim], "arm": [self.braco], "body": [self.mitya], "field": [*self.team],
+            "board": [self.uno], "lamp": [self.lampada],
+        }  # fmt: skip
+        self.serial = {link: PtyPort(*robots, link=folder / link) for link, robots in serial.items()}
         self.beta_at = f"127.0.0.1:{beta}"
         self.endpoint = f"tcp/127.0.0.1:{bus}"
         file = folder / "demo.toml"
-        file.write_text(CONFIGURATION.format(bus=bus, wifi=wifi, beta=beta, radio=self.radio.path, arm=self.arm.path))
+        paths = {link: port.path for link, port in self.serial.items()}
+        file.write_text(CONFIGURATION.format(bus=bus, wifi=wifi, beta=beta, **paths))
         self.broker = Broker(load(file))
         self.client: Client
         self.listener: Listener
@@ -123,16 +177,24 @@ class Stage:
     async def ready(cls, folder: Path) -> AsyncIterator["Stage"]:
         """The stage, with all that is on it running."""
         stage = cls(folder)
-        click.echo(styled("One broker, three simulated robots, three kinds of link", bold=True))
-        click.echo(f"  MNERIM  speaks PSIU ASCII on a pseudo-terminal, as on a serial port: {stage.radio.path}")
-        click.echo(f"  BETA    speaks PSIU ASCII on UDP: {stage.beta_at}")
-        click.echo(f"  BRACO   speaks PSIU HEXA on a second pseudo-terminal: {stage.arm.path}")
-        click.echo(f"  base    the broker; programs connect to {stage.endpoint}")
-        async with Simulation(stage.radio, stage.wifi, stage.arm):
+        paths = {link: port.path for link, port in stage.serial.items()}
+        click.echo(styled("One broker, and simulated robots of six protocols on two kinds of link", bold=True))
+        for name, text in (
+            ("MNERIM", f"speaks PSIU ASCII on a pseudo-terminal, as on a serial port: {paths['radio']}"),
+            ("BETA", f"speaks PSIU ASCII on UDP: {stage.beta_at}"),
+            ("BRACO", f"speaks PSIU HEXA on a second pseudo-terminal: {paths['arm']}"),
+            ("MITYA", f"is a Robot Mitya, told one letter and a number, which hardly ever answers: {paths['body']}"),
+            ("GOLEIRO", f"is one of a soccer team, which is told its wheels 30 times a second: {paths['field']}"),
+            ("UNO", f"is an Arduino with Firmata, whose pins have names: {paths['board']}"),
+            ("LAMPADA", f"is an Arduino with Amarino, as Android phones command it: {paths['lamp']}"),
+            ("base", f"the broker; programs connect to {stage.endpoint}"),
+        ):
+            click.echo(f"  {name:<8} {text}")
+        async with Simulation(stage.wifi, *stage.serial.values()):
             await stage.broker.start()
             try:
                 async with stage._program():
-                    await stage._until("the three links open", stage._links_open)
+                    await stage._until("all links open", stage._links_open)
                     yield stage
             finally:
                 await stage.broker.stop()
@@ -192,14 +254,27 @@ class Stage:
             raise NotAsItShould(f"the signal of garra is {signal}")
         click.echo(f"  BETA heard sucesso; garra is at 45 degrees, which BRACO knows as signal {signal}")
 
+    async def call_the_others(self) -> None:
+        _step(5, "Robots of other protocols are called in the same way", "psiu call ROBOT COMMAND ...")
+        body, goleiro = self.mitya.body, self.team[0]
+        calls: tuple[tuple[str, str, Callable[[], bool]], ...] = (
+            ("MITYA D -100", "both motors run backwards", lambda: body.left == body.right == -100),
+            ("GOLEIRO rodas 15 -31", "it turns on the spot", lambda: _was_told(goleiro, "rodas", "15", "-31")),
+            ("UNO led 1", f"pin {LED} is on", lambda: self.uno.states[LED] == 1),
+            ("LAMPADA brilho 200", "it shines as it was told", lambda: _was_told(self.lampada, "flag/b", "200")),
+        )
+        for line, told, done in calls:
+            robot, command, *parameters = line.split()
+            answer = await self._call(robot, command, *map(int, parameters))
+            if answer.status == "falha" or not done():
+                raise NotAsItShould(f"{robot} was told {command} and did not do it")
+            click.echo(f"  {f'psiu call {line}':<31} {answer_line(robot, answer)}: {told}")
+
     async def close_the_books(self) -> None:
-        _step(5, "Where every frame went", "psiu robots, psiu links, psiu ledger")
-        cards = await asyncio.to_thread(self.client.cards)
+        _step(6, "Where every frame went", "psiu links, psiu ledger")
         links = (await asyncio.to_thread(self.client.ask, "links"))["base"]
         told = (await asyncio.to_thread(self.client.ask, "ledger"))["base"]
         ledger = Ledger.model_validate(told)
-        show_robots(cards, drawn=True)
-        click.echo("")
         show_links([("base", Link.model_validate(link)) for link in links], drawn=True)
         click.echo("")
         show_ledger([("base", ledger)], drawn=True)
@@ -273,6 +348,10 @@ class Listener:
 def _step(number: int, text: str, how: str) -> None:
     click.echo("")
     click.echo(f"{styled(f'{number}. {text}', bold=True)}   [{how}]")
+
+
+def _was_told(robot: Robot, subject: str, *parameters: str) -> bool:
+    return any((heard.subject, heard.parameters) == (subject, parameters) for heard in robot.heard)
 
 
 def _free_port(kind: socket.SocketKind) -> int:

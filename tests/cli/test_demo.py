@@ -9,7 +9,8 @@ import pytest
 from click.testing import Result
 
 from psiu_broker.cli import demo
-from psiu_broker.simulator import AsciiRobot, HexaRobot
+from psiu_broker.protocols import PROTOCOLS
+from psiu_broker.simulator import AsciiRobot, HexaRobot, MityaBody
 
 Run = Callable[..., Result]
 
@@ -28,11 +29,16 @@ def test_the_demo_shows_the_main_job_within_its_time_and_ends_well(start: Callab
         "MNERIM → BETA  giradireita sucesso  radio",
         "BETA → BRACO  garra 45  wifi",
         "BRACO → BETA  garra sucesso  @self",
+        "psiu call MITYA D -100          MITYA: sent; this robot does not answer",
+        "psiu call GOLEIRO rodas 15 -31  GOLEIRO: sent; this robot does not answer",
+        "psiu call UNO led 1             UNO: sucesso",
+        "psiu call LAMPADA brilho 200    LAMPADA: 200",
         "The books of base balance",
         "All as it should be",
     ):
         assert each in text
     assert "\x1b" not in text
+    assert all(f'protocol = "{protocol}"' in demo.CONFIGURATION for protocol in PROTOCOLS)
 
 
 @pytest.fixture
@@ -52,6 +58,13 @@ class Lame(AsciiRobot):
         return 0.0, ("falha",)
 
 
+class Broken(MityaBody):
+    """Its motors do not run."""
+
+    def _do(self, word: str, value: int) -> bool:
+        return word == "drive" or super()._do(word, value)
+
+
 class Deaf(HexaRobot):
     """Says nothing."""
 
@@ -62,7 +75,11 @@ class Deaf(HexaRobot):
 @pytest.mark.usefixtures("log")
 @pytest.mark.parametrize(
     ("name", "robot", "said"),
-    [("AsciiRobot", Lame, "MNERIM answered falha"), ("HexaRobot", Deaf, "BRACO was not found")],
+    [
+        ("AsciiRobot", Lame, "MNERIM answered falha"),
+        ("HexaRobot", Deaf, "BRACO was not found"),
+        ("MityaBody", Broken, "MITYA was told D and did not do it"),
+    ],
 )
 def test_what_does_not_happen_fails_with_one_clear_line(
     daemon: Run, monkeypatch: pytest.MonkeyPatch, name: str, robot: type, said: str
