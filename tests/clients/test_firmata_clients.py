@@ -18,7 +18,7 @@ from psiu_broker.config import load
 from psiu_broker.simulator import HexaRobot, PtyPort
 
 HERE = Path(__file__).parent
-PATIENCE_S = 10.0
+PATIENCE_S = 20.0
 
 
 class Lab:
