@@ -9,7 +9,7 @@ import pytest
 from click.testing import Result
 
 from psiu_broker.cli import demo
-from psiu_broker.protocols import PROTOCOLS
+from psiu_broker.cli.simulated import SIMULATED
 from psiu_broker.simulator import AsciiRobot, HexaRobot, MityaBody
 
 Run = Callable[..., Result]
@@ -38,7 +38,7 @@ def test_the_demo_shows_the_main_job_within_its_time_and_ends_well(start: Callab
     ):
         assert each in text
     assert "\x1b" not in text
-    assert all(f'protocol = "{protocol}"' in demo.CONFIGURATION for protocol in PROTOCOLS)
+    assert all(f'protocol = "{protocol}"' in demo.CONFIGURATION for protocol in SIMULATED)
 
 
 @pytest.fixture

@@ -45,8 +45,31 @@ def events(robot: Any, kind: str) -> list[dict[str, Any]]:
     return [event for line in robot.out if (event := json.loads(line))["event"] == kind]
 
 
-def test_every_protocol_of_the_broker_can_be_simulated() -> None:
-    assert list(SIMULATED) == list(PROTOCOLS)
+def test_only_what_the_broker_speaks_is_simulated() -> None:
+    assert set(SIMULATED) <= set(PROTOCOLS)
+
+
+@pytest.mark.parametrize(
+    ("words", "question", "answer"),
+    [
+        (("--protocol", "firmata", "--firmware", "A"), b"\xf9", bytes.fromhex("f90205f07902054100f7")),
+        (("--protocol", "amarino"), b"B7\x13", b"\x127\x13"),
+        (("--protocol", "mitya", "--version", "2014"), b"G00xx", b"#0001"),
+        (
+            ("--version", "0.5", "--name", "MNERIM"),
+            b"MNERIM031parafrente 100 PC02024",
+            b"PC035parafrente sucesso MNERIM02656",
+        ),
+    ],
+)
+def test_robots_answer_at_a_udp_port(start: Start, words: tuple[str, ...], question: bytes, answer: bytes) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        program.settimeout(10)
+        robot = start("psiu", "sim", *words, "--udp", "127.0.0.1:0", "--json")
+        host, port = json.loads(robot.until('"ready"'))["where"].split(":")
+        program.sendto(question, (host, int(port)))
+        assert program.recv(1000) == answer
 
 
 @pytest.mark.parametrize("protocol", SIMULATED)

