@@ -110,8 +110,8 @@ def trace(connection: Connection, a: str, b: str) -> None:
     silent = next((each for each in traces if not each.answered), None)
     if silent is not None:
         reason = silent.reason or "it was silent"
-        told = "nothing was sent" if silent.question == NOTHING else f"{silent.b} did not answer {silent.question}"
-        raise NoWay(f"{told}: {reason}")
+        outcome = "nothing was sent" if silent.question == NOTHING else f"{silent.b} did not answer {silent.question}"
+        raise NoWay(f"{outcome}: {reason}")
 
 
 def followed(decisions: Mapping[str, Why], begin: str | None = None) -> Path:
