@@ -138,7 +138,7 @@ class Router:
         translatable = self._is_translatable(protocol, target, arrived)
         if target.way.link not in self.ports:
             return Decision("translate" if translatable else "drop", verdict=LINK_DOWN)
-        if target.way.link == MESH:
+        if target.way.link == MESH and not translatable:
             return self._decide_by_mesh(target, arrived)
         if target.protocol != protocol:
             return Decision("translate") if translatable else Decision("drop", verdict=REFUSED)
@@ -265,9 +265,13 @@ class Router:
         return DOUBLE
 
     def _is_translatable(self, protocol: str, target: Route, arrived: Way) -> bool:
-        """Whether the broker asks `target` in the sender's stead: its protocol is another one, and words tell which."""
-        asked = protocol == "psiu-ascii" or arrived.link in self._plays
-        return asked and target.protocol != protocol and target.way.link != MESH
+        """Whether the broker asks `target` in the sender's stead: its protocol is another one, and words tell which.
+
+        A robot of another broker is asked there; only a program that it is played to has nobody there.
+        """
+        if arrived.link in self._plays:
+            return target.protocol != protocol
+        return protocol == "psiu-ascii" and target.protocol != protocol and target.way.link != MESH
 
     def _decide_by_mesh(self, target: Route, arrived: Way) -> Decision:
         """For a robot of another broker: to that broker, never from one to the next."""
