@@ -78,8 +78,10 @@ class Calling:
         self.settling_s: Callable[[], float] = lambda: 0.0
         """How long another broker may take to say that it heard a robot, too, that was searched for."""
 
-    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
+    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
         """Tell `robot` a command and return its answer, within `request.timeout_s` if it is given.
+
+        It is not sent if it was `asked_at` a time longer ago than a frame may wait for the robot's link.
 
         Raises:
             CallError: there is no answer; its code says why.
@@ -92,22 +94,24 @@ class Calling:
         timeout_s = request.timeout_s
         if timeout_s is not None:
             timeout_s -= asyncio.get_running_loop().time() - begun
-        return await self.ask(route, command, request.parameters, timeout_s)
+        fresh_s = inf if asked_at is None else self._fresh_s(route, asked_at)
+        return await self.ask(route, command, request.parameters, timeout_s, fresh_s)
 
-    async def tell(self, robot: Address, command: str, request: CallRequest) -> None:
-        """Send a command and go on: what the robot answers is nobody's.
+    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
+        """Send a command and go on: what the robot answers is nobody's. `asked_at`: as in `call`; default: now.
 
         Raises:
             CallError: it cannot be sent; its code says why.
         """
         begun = asyncio.get_running_loop().time()
+        asked_at = self._clock() if asked_at is None else asked_at
         route = self._router.find(robot) or await self._seek(robot, request.timeout_s)
         if route.way == SELF:
             await self._told(command, request)
             return
         if route.way.link == MESH:
             raise _elsewhere(route)
-        fresh_s = self._exchange.links[route.way.link].configuration.options.max_age_s
+        fresh_s = self._fresh_s(route, asked_at)
         if request.timeout_s is not None:
             fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
         await self.conversations.tell(self._robot(route), command, request.parameters, fresh_s=fresh_s)
@@ -216,6 +220,11 @@ class Calling:
         return Traffic(found.frames_out, max(found.last_sent, last_heard), found.frames_in)
 
     # Inside.
+
+    def _fresh_s(self, route: Route, asked_at: float) -> float:
+        """How long what was asked for then may still wait before it is too late for the robot."""
+        link = self._exchange.links.get(route.way.link)
+        return inf if link is None else link.configuration.options.max_age_s - (self._clock() - asked_at)
 
     def _dropped(self, robot: Address, verdict: Verdict) -> CallError:
         code, text = _DROPPED.get(verdict, ("refused", verdict))

@@ -8,8 +8,8 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from typing import Final, Protocol
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
 
 from psiu_broker.config import Configuration
 from psiu_broker.config.who import Ends, ends
@@ -26,6 +26,9 @@ from psiu_broker.routing.verdicts import ANSWERED, QUEUE_FULL, Verdict
 
 CALLS_KEPT: Final = 16
 """How many calls of one program may wait for those before them."""
+STOPS_KEPT: Final = 8
+"""How many stops of one program may wait for their answers; of any more the answers are not waited for."""
+STOPPED: Final = "a stop came meanwhile"
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +36,10 @@ log = logging.getLogger(__name__)
 class Robots(Protocol):
     """What programs are offered of robots."""
 
-    async def call(self, robot: Address, command: str, request: CallRequest) -> Answer:
+    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
         """As `Calling.call`."""
 
-    async def tell(self, robot: Address, command: str, request: CallRequest) -> None:
+    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
         """As `Calling.tell`."""
 
 
@@ -56,7 +59,7 @@ class Playing:
         self._played: Mapping[str, Ends] = {
             name: ends(configuration, link) for name, link in configuration.links.items() if link.options.plays
         }
-        self._programs: dict[Way, _Program] = {}
+        self._programs: dict[Way, Program] = {}
 
     def link_opened(self, link: Link, now: float) -> None:
         """Where a link has one far end, the program is there now."""
@@ -69,12 +72,17 @@ class Playing:
         program = self._program(way, now)
         if program is None:
             return None
-        return ANSWERED if program.do(program.persona.heard(frame, now), now) else QUEUE_FULL
+        return ANSWERED if program.hear(frame, now) else QUEUE_FULL
 
-    def told(self, frame: Frame, description: Description, now: float) -> None:
+    def told(self, robot: Address, describe: Callable[[], Description], now: float) -> None:
         """A robot said something to nobody in particular: programs that it is played to hear of it."""
-        for program in [each for each in self._programs.values() if each.robot == frame.source]:
-            program.do(program.persona.told(description, now), now)
+        if not self._programs:
+            return
+        programs = [each for each in self._programs.values() if each.robot == robot]
+        if programs:
+            description = describe()
+            for program in programs:
+                program.tell(description, now)
 
     def link_closed(self, link: str) -> None:
         self._forget([way for way in self._programs if way.link == link])
@@ -84,11 +92,11 @@ class Playing:
 
     async def close(self) -> None:
         """Forget every program, and wait until nothing is done for it any more."""
-        tasks = [program.task for program in self._programs.values() if program.task is not None]
+        tasks = [task for program in self._programs.values() for task in program.tasks]
         self._forget(list(self._programs))
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _program(self, way: Way, now: float) -> "_Program | None":
+    def _program(self, way: Way, now: float) -> "Program | None":
         program = self._programs.get(way)
         if program is not None:
             return program
@@ -100,7 +108,7 @@ class Playing:
         if persona is None:
             return None
         options = configuration.map or persona.Options()
-        program = self._programs[way] = _Program(
+        program = self._programs[way] = Program(
             persona(str(played.own), configuration.codec, options),
             played.own,
             played.far(way.peer),
@@ -109,7 +117,7 @@ class Playing:
             self._robots,
             self._clock,
         )
-        program.do(program.persona.opened(now), now)
+        program.open(now)
         return program
 
     def _forget(self, ways: Iterable[Way]) -> None:
@@ -117,8 +125,15 @@ class Playing:
             self._programs.pop(way).end()
 
 
-class _Program:
-    """One program, what it is played, and what it waits for."""
+class _Asked(NamedTuple):
+    """A call, and when the program asked for it."""
+
+    call: Call
+    at: float
+
+
+class Program:
+    """One program, what it is played, and what it waits for. A mistake of its persona is its own trouble."""
 
     def __init__(
         self,
@@ -130,98 +145,152 @@ class _Program:
         robots: Robots,
         clock: Callable[[], float],
     ) -> None:
-        self.persona = persona
         self.robot = robot
-        self.task: asyncio.Task[None] | None = None
+        self.tasks: set[asyncio.Task[None]] = set()
+        """All that goes on for it."""
+        self._persona = persona
         self._address = address
         self._protocol = protocol
         self._send = send
         self._robots = robots
         self._clock = clock
-        self._waiting: deque[Call] = deque()
-        self._newest: dict[str, Call] = {}
+        self._waiting: deque[_Asked] = deque()
+        self._newest: dict[str, _Asked] = {}
+        self._under_way: _Asked | None = None
+        self._worker: asyncio.Task[None] | None = None
         self._stops: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._mistakes = 0
         self._ended = False
 
-    def do(self, actions: Iterable[Say | Call], now: float) -> bool:
-        """Say what is to be said, begin what is to be done; False if something was refused for want of room."""
-        done = True
-        for action in actions:
-            if isinstance(action, Say):
-                self._send(Frame(self.robot, self._address, action.subject, action.payload, self._protocol))
-            else:
-                done = self._take(action, now) and done
-        self._set_timer(now)
-        return done
+    def open(self, now: float) -> None:
+        """The program has come."""
+        self._do(lambda: self._persona.opened(now), now)
+
+    def hear(self, frame: Frame, now: float) -> bool:
+        """Do what the program wants; False if something of it was not to be had, for want of room."""
+        return self._do(lambda: self._persona.heard(frame, now), now)
+
+    def tell(self, description: Description, now: float) -> None:
+        """The robot said something to nobody in particular."""
+        self._do(lambda: self._persona.told(description, now), now)
 
     def end(self) -> None:
-        """The program is gone: nothing more is begun for it."""
+        """The program is gone: nothing more is begun for it, and only its stops are seen through."""
         self._ended = True
         self._waiting.clear()
         self._newest.clear()
         if self._timer is not None:
             self._timer.cancel()
-        if self.task is not None:
-            self.task.cancel()
+        if self._worker is not None:
+            self._worker.cancel()
 
-    def _take(self, call: Call, now: float) -> bool:
+    def _do(self, ask: Callable[[], Iterable[Say | Call]], now: float) -> bool:
+        """Say what is to be said, begin what is to be done; False if something was refused for want of room."""
+        try:
+            actions = tuple(ask())
+            until = self._persona.waits_until()
+        except Exception:
+            self._mistakes += 1
+            if self._mistakes & (self._mistakes - 1) == 0:  # the 1st, 2nd, 4th, 8th, …
+                log.exception("what is played to %s as %s made a mistake", self._address, self.robot)
+            return False
+        done = True
+        for action in actions:
+            if isinstance(action, Say):
+                self._send(Frame(self.robot, self._address, action.subject, action.payload, self._protocol))
+            else:
+                done = self._take(_Asked(action, now)) and done
+        self._set_timer(until, now)
+        return done
+
+    def _take(self, asked: _Asked) -> bool:
+        call = asked.call
         if self._ended:
             return False
         if is_stop(call.command):
-            # What waits is older than the stop, and would undo it.
-            self._waiting.clear()
-            self._newest.clear()
-            self._start_stop(call)
+            self._sweep(asked.at)
+            self._start_stop(asked)
             return True
         if call.newest:
-            self._newest[call.command] = call
+            self._newest[call.command] = asked
         elif len(self._waiting) < CALLS_KEPT:
-            self._waiting.append(call)
+            self._waiting.append(asked)
         else:
-            self.do(self.persona.answered(call, None, "busy: too much waits already", now), now)
+            self._answer(call, None, "busy: too much waits already", asked.at)
             return False
-        if self.task is None:
-            self.task = asyncio.get_running_loop().create_task(self._work())
+        if self._worker is None:
+            self._worker = self._start(self._work())
         return True
 
-    def _start_stop(self, call: Call) -> None:
-        task = asyncio.get_running_loop().create_task(self._carry_out(call))
+    def _sweep(self, now: float) -> None:
+        """Give up all that is older than a stop, and would undo it."""
+        swept = [*([self._under_way] if self._under_way else []), *self._newest.values(), *self._waiting]
+        self._waiting.clear()
+        self._newest.clear()
+        if self._worker is not None:
+            self._worker.cancel()
+        self._worker = self._under_way = None
+        for asked in swept:
+            self._answer(asked.call, None, STOPPED, now)
+
+    def _start_stop(self, asked: _Asked) -> None:
+        if len(self._stops) >= 2 * STOPS_KEPT:
+            return  # Those whose answers are not waited for have not left yet: they stop it as well.
+        task = self._start(self._carry_out(asked, waits=len(self._stops) < STOPS_KEPT))
         self._stops.add(task)
         task.add_done_callback(self._stops.discard)
 
+    def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+        return task
+
     async def _work(self) -> None:
+        worker = asyncio.current_task()
         try:
             while self._waiting or self._newest:
                 newest = next(iter(self._newest), None)
-                await self._carry_out(self._waiting.popleft() if newest is None else self._newest.pop(newest))
+                asked = self._under_way = self._waiting.popleft() if newest is None else self._newest.pop(newest)
+                await self._carry_out(asked, waits=not asked.call.newest)
         finally:
-            self.task = None
+            if self._worker is worker:
+                self._worker = self._under_way = None
 
-    async def _carry_out(self, call: Call) -> None:
-        answer, error = None, ""
+    async def _carry_out(self, asked: _Asked, *, waits: bool) -> None:
+        call, answer, error = asked.call, None, ""
         try:
             request = CallRequest(parameters=list(call.parameters))
-            if call.newest:
-                await self._robots.tell(self.robot, call.command, request)
+            if waits:
+                answer = await self._robots.call(self.robot, call.command, request, asked.at)
             else:
-                answer = await self._robots.call(self.robot, call.command, request)
+                await self._robots.tell(self.robot, call.command, request, asked.at)
         except (CallError, ValueError) as failure:
             error = str(failure)
             log.debug("%s told %s %s: %s", self._address, self.robot, call.command, error)
-        now = self._clock()
-        if not self._ended and (error or not call.newest):
-            self.do(self.persona.answered(call, answer, error, now), now)
+        if error or answer is not None:
+            self._answer(call, answer, error, self._clock())
 
-    def _set_timer(self, now: float) -> None:
+    def _answer(self, call: Call, answer: Answer | None, error: str, now: float) -> None:
+        """Tell of the outcome of a call; nothing is said of a set-point that a stop took the place of."""
+        if self._ended:
+            return
+
+        def say() -> Sequence[Say]:
+            said = self._persona.answered(call, answer, error, now)
+            return () if call.newest and error == STOPPED else said
+
+        self._do(say, now)
+
+    def _set_timer(self, until: float | None, now: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        until = self.persona.waits_until()
         if until is not None and not self._ended:
             self._timer = asyncio.get_running_loop().call_later(max(0.0, until - now), self._due)
 
     def _due(self) -> None:
         self._timer = None
         now = self._clock()
-        self.do(self.persona.due(now), now)
+        self._do(lambda: self._persona.due(now), now)

@@ -80,6 +80,7 @@ class Resident:
             return
         if self._conversations.heard(frame, now) or self._says_its_name(frame, way, now):
             return
+        self._tell_programs(frame, now)
         reply = self._responder.answer(frame, now, self._conversations.pinging(frame.source))
         if reply is None:
             return
@@ -128,7 +129,7 @@ class Resident:
         """Greet, as far as our allowance on the link goes: robots are to be known before anybody needs them."""
         options = link.configuration.options
         self._playing.link_opened(link, now)
-        if not options.greet:
+        if not options.greet or options.plays is not None:
             return
         if link.codec.protocol not in _TALKING:
             for route in self._router.robots():
@@ -157,7 +158,9 @@ class Resident:
     def robot_heard(self, route: Route) -> None:
         self._calling.robot_heard(route)
         link = self._exchange.links.get(route.way.link)
-        if link is not None and link.adapter.datagrams and route.protocol not in _TALKING:
+        if link is None or not link.adapter.datagrams or link.configuration.options.plays is not None:
+            return
+        if route.protocol not in _TALKING and link.configuration.options.greet:
             # When the link opened, nobody was there to be greeted.
             self._meet(route)
 
@@ -195,7 +198,12 @@ class Resident:
         """A frame of a robot that knows nothing of us: perhaps an answer, perhaps something to pass on."""
         self._calling.learn(frame)
         if not self._conversations.heard(frame, now):
-            self._playing.told(frame, self.describe(frame), now)
+            self._tell_programs(frame, now)
+
+    def _tell_programs(self, frame: Frame, now: float) -> None:
+        """Those that the sender is played to hear what it says."""
+        route = self._router.find(frame.source)
+        self._playing.told(frame.source if route is None else route.robot, lambda: self.describe(frame), now)
 
     def _says_its_name(self, frame: Frame, way: Way, now: float) -> bool:
         """Whether `frame` answers our qualseunome or ping: its sender's first on the link where we just asked.

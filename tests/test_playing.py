@@ -1,0 +1,278 @@
+"""Programs that are played a robot: what reaches the robot, what does not, and what they hear; no bus, no sockets."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
+
+from psiu_broker.codecs import psiu_ascii
+from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.identity import identity
+from psiu_broker.config.tables import (
+    BrokerConfiguration,
+    Configuration,
+    LinkConfiguration,
+    RobotConfiguration,
+    ZenohConfiguration,
+)
+from psiu_broker.config.who import bindings, ends
+from psiu_broker.exchange import Exchange
+from psiu_broker.frame import MESH, NOBODY, Address, Frame, Way
+from psiu_broker.link import Link
+from psiu_broker.messages import Answer, CallRequest
+from psiu_broker.playing import CALLS_KEPT, STOPS_KEPT, Program
+from psiu_broker.profiles.mitya_persona import MityaPersona
+from psiu_broker.profiles.persona import Call, Persona, Say
+from psiu_broker.profiles.profile import Description
+from psiu_broker.profiles.psiu import PsiuOptions
+from psiu_broker.protocols import PROTOCOLS
+from psiu_broker.report import Report
+from psiu_broker.resident import Resident
+from psiu_broker.routing.router import ANY, Port, Router
+from psiu_broker.routing.table import Route
+
+MNERIM, BASE = Address.named("MNERIM"), Address.named("base")
+MAP = {
+    "D": {"command": "parafrente", "at_zero": "pare", "scale": 1},
+    "y": {"command": "acena"},
+    "n": {"command": "nega"},
+}
+ONE, OTHER = ("10.0.0.1", 9001), ("10.0.0.2", 9001)
+
+
+async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not true():  # noqa: ASYNC110
+            await asyncio.sleep(0.002)
+
+
+def panel(name: str = "painel", adapter: MemoryAdapter | None = None) -> LinkConfiguration:
+    made = configuration(name, "mitya", adapter, {"version": "2013"}, plays="MNERIM")
+    return replace(made, map=MityaPersona.Options.model_validate({"G": MAP["D"], "y": MAP["y"], "n": MAP["n"]}))
+
+
+def radio(**options: object) -> LinkConfiguration:
+    return configuration("radio", "psiu-ascii", None, None, **{"greet": False, **options})
+
+
+def words(*said: str) -> bytes:
+    """What MNERIM tells the broker."""
+    return codec_of(configuration()).encode(psiu_ascii.message(MNERIM, BASE, *said))
+
+
+class Lab:
+    """MNERIM is on `radio`, where there is one; programs are at the other links."""
+
+    def __init__(self, *links: LinkConfiguration) -> None:
+        robots = {"MNERIM": RobotConfiguration("MNERIM", "radio", "psiu-ascii", None, None, PsiuOptions())}
+        made = Configuration(
+            BrokerConfiguration(name="base"), ZenohConfiguration(), {link.name: link for link in links}, robots
+        )
+        plays = [link.name for link in links if link.options.plays]
+        self.router = Router(
+            {BASE: "psiu-ascii"},
+            bindings(made),
+            identity,
+            self._heard,
+            self._gone,
+            plays=plays,
+        )
+        self.exchange = Exchange(BASE, self.router)
+        self.resident = self.exchange.resident = Resident(made, self.exchange)
+        self.links: dict[str, Link] = {}
+        self.far: dict[str, MemoryTransport] = {}
+        directory = Directory({"base"}, {"base", "MNERIM"})
+        for link in links:
+            codec = partial(PROTOCOLS[link.protocol].codec, link.codec, directory, datagrams=link.adapter.datagrams)
+            opened = self.links[link.name] = Link(link, codec, self.exchange, ends=ends(made, link))
+            self.exchange.add(opened)
+            assert isinstance(link.adapter, MemoryAdapter)
+            self.far[link.name] = MemoryTransport(link.adapter.ends)
+            opened.connected(self.far[link.name])
+
+    def _heard(self, route: Route) -> None:
+        self.resident.robot_heard(route)
+
+    def _gone(self, route: Route) -> None:
+        self.resident.robot_gone(route)
+
+    def hears(self, link: str, data: bytes, peer: object = None) -> None:
+        self.links[link].received(data, peer)
+
+    @property
+    def told(self) -> list[str]:
+        """What MNERIM was told."""
+        return [" ".join(data.decode().split()[2:-2]) for data in self.far["radio"].wires]
+
+    def balances(self) -> bool:
+        return Report("base", self.exchange, self.resident.commands).ledger().balances
+
+
+@asynccontextmanager
+async def lab(*links: LinkConfiguration) -> AsyncIterator[Lab]:
+    made = Lab(*links)
+    yield made
+    assert made.balances()
+    await made.resident.close()
+    assert made.balances()
+
+
+async def test_a_set_point_that_waited_for_its_turn_is_not_sent_after_a_stop() -> None:
+    async with lab(radio(), panel()) as made:
+        request = CallRequest(parameters=[50])
+        call = asyncio.create_task(made.resident.call(MNERIM, "paratras", request))
+        await until(lambda: made.told == ["paratras 50"])
+        made.hears("painel", b"G0064")
+        await asyncio.sleep(0.02)
+        made.hears("painel", b"G0000")
+        await until(lambda: made.told == ["paratras 50", "pare"])
+        made.hears("radio", words("paratras", "sucesso"))
+        await call
+        await asyncio.sleep(0.05)
+        assert made.told == ["paratras 50", "pare"]
+        made.hears("radio", words("pare", "sucesso"))
+        made.hears("painel", b"G0064")  # the same again is news after a stop
+        await until(lambda: made.told == ["paratras 50", "pare", "parafrente 100"])
+
+
+async def test_what_waited_too_long_behind_other_calls_of_its_program_is_not_sent() -> None:
+    async with lab(radio(max_age_s=0.1, timeout_s=0.3, retries=0), panel()) as made:
+        made.hears("painel", b"y0001")
+        await until(lambda: made.told == ["acena"])
+        made.hears("painel", b"n0001")
+        made.hears("painel", b"G0064")
+        await until(lambda: made.far["painel"].wires.count(b"#0001") == 3 or len(made.told) > 1)
+        assert made.told == ["acena"]
+
+
+async def test_programs_that_send_the_same_at_once_are_no_doubles_of_each_other() -> None:
+    async with lab(radio(), panel("um"), panel("dois"), panel("udp", MemoryDatagrams(ends=(ONE, OTHER)))) as made:
+        made.hears("um", b"G0064")
+        made.hears("dois", b"G0064")
+        made.hears("udp", b"G0064", ONE)
+        made.hears("udp", b"G0064", OTHER)
+        await until(lambda: all(b"#0000" in made.far[each].wires for each in ("um", "dois", "udp")))
+        assert [account.fates["answered"] for name, account in made.exchange.accounts.items() if name != "@self"][
+            1:
+        ] == [1, 1, 2]
+
+
+async def test_of_a_robot_that_went_to_another_broker_its_program_hears_that_it_cannot() -> None:
+    async with lab(radio(), panel()) as made:
+        away = Way(MESH, "other")
+        made.router.link_up(Port(MESH, ANY, lambda: (away,)))
+        made.router.announced((MNERIM,), away, "psiu-ascii", 0.0)
+        made.hears("painel", b"y0001")
+        await until(lambda: made.far["painel"].wires == [b"#0001"])
+
+
+async def test_programs_are_not_greeted_as_robots_are() -> None:
+    board = configuration("placa", "firmata", MemoryDatagrams(ends=(ONE,)), {"role": "board"}, plays="MNERIM")
+    async with lab(radio(), board) as made:
+        made.hears("placa", b"\x90\x00\x00", ONE)
+        assert made.exchange.accounts["@self"].arrived == 0
+
+
+async def test_a_robot_of_words_is_heard_by_those_who_are_played_it() -> None:
+    phone = configuration("celular", "amarino", None, {"role": "board"}, plays="MNERIM")
+    async with lab(radio(), phone) as made:
+        made.hears("radio", words("sonar", "12"))
+        assert [b"12" in wire for wire in made.far["celular"].wires] == [True]
+
+
+# One program.
+
+
+class Listener(Persona):
+    """Does as it is told: its frames' payloads are commands; `newest` those that begin with a *."""
+
+    def __init__(self, name: str = "", codec: Any = None, options: Any = None) -> None:
+        self.answers: list[tuple[str, str]] = []
+
+    def heard(self, frame: Frame, now: float) -> Sequence[Say | Call]:
+        command = frame.payload.decode()
+        if command == "raise":
+            raise RuntimeError("a mistake of its own")
+        return (Call(command.removeprefix("*"), newest=command.startswith("*")),)
+
+    def answered(self, call: Call, answer: Answer | None, error: str, now: float) -> Sequence[Say]:
+        self.answers.append((call.command, error))
+        return ()
+
+    def told(self, description: Description, now: float) -> Sequence[Say]:
+        raise RuntimeError("a mistake of its own")
+
+
+class Silent:
+    """Robots that never answer."""
+
+    def __init__(self) -> None:
+        self.called: list[str] = []
+        self.was_told: list[str] = []
+
+    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
+        self.called.append(command)
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
+        self.was_told.append(command)
+
+
+def program(robots: Silent) -> tuple[Program, Listener]:
+    listener = Listener()
+    return Program(listener, MNERIM, NOBODY, "mitya", lambda frame: None, robots, lambda: 0.0), listener
+
+
+def hears(made: Program, command: str) -> bool:
+    return made.hear(Frame(NOBODY, MNERIM, "", command.encode(), "mitya"), 0.0)
+
+
+async def end(made: Program) -> None:
+    made.end()
+    for task in made.tasks:
+        task.cancel()
+    await asyncio.gather(*made.tasks, return_exceptions=True)
+
+
+async def test_a_program_learns_of_what_a_stop_swept_away() -> None:
+    made, listener = program(Silent())
+    hears(made, "a")
+    await asyncio.sleep(0)
+    for command in ("b", "*c", "pare"):
+        hears(made, command)
+    assert {command for command, error in listener.answers if error} == {"a", "b", "c"}
+    await end(made)
+
+
+async def test_no_flood_of_stops_piles_up_and_none_is_lost() -> None:
+    robots = Silent()
+    made, _ = program(robots)
+    for _ in range(500):
+        hears(made, "pare")
+        await asyncio.sleep(0)
+    assert len(made.tasks) <= 2 * STOPS_KEPT
+    await until(lambda: len(robots.called) + len(robots.was_told) == 500)
+    await end(made)
+
+
+async def test_no_flood_of_commands_piles_up() -> None:
+    made, listener = program(Silent())
+    done = [hears(made, "a") for _ in range(500)]
+    assert done == [True] * CALLS_KEPT + [False] * (500 - CALLS_KEPT)
+    assert len(made.tasks) == 1
+    assert len(listener.answers) == 500 - CALLS_KEPT
+    await end(made)
+
+
+async def test_a_mistake_of_a_persona_is_that_program_s_trouble_alone(caplog: pytest.LogCaptureFixture) -> None:
+    made, _ = program(Silent())
+    assert not hears(made, "raise")
+    made.tell({}, 0.0)
+    assert "a mistake of its own" in caplog.text
+    made.end()
