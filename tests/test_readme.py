@@ -17,8 +17,7 @@ from psiu_broker.config import BrokerConfiguration, LinkOptions, MeshConfigurati
 from psiu_broker.config.tables import RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
-from psiu_broker.profiles import Node
-from psiu_broker.protocols import CODECS
+from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.registry import adapter_class, adapter_names
 
 TREE = Path(__file__).parents[1]
@@ -28,6 +27,7 @@ READMES = pytest.mark.parametrize("readme", [ENGLISH, PORTUGUESE], ids=["en", "p
 GROUPS: dict[str, click.Group] = {"psiu": tool.psiu, "psiu-broker": daemon.psiu_broker}
 
 MANY_BROKERS = re.compile(r"^## (?:Many|Muitos) brokers\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+PROTOCOLS_TOLD = re.compile(r"^## (?:Protocols|Protocolos)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MODELS: dict[str, type[BaseModel]] = {
     "[broker]": BrokerConfiguration,
@@ -35,9 +35,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "[mesh]": MeshConfiguration,
     "[links.NAME]": LinkOptions,
     "[robots.NAME]": RobotTable,
-    "nodes.NAME": Node,
-    **{f'adapter = "{name}"': adapter_class(name) for name in ("serial", "udp", "rfcomm")},
-    **{f'protocol = "{name}"': codec.Options for name, codec in CODECS.items()},
+    **{f'adapter = "{name}"': adapter_class(name) for name in ("serial", "udp", "rfcomm", "pty")},
 }
 
 
@@ -55,10 +53,10 @@ def code(text: str) -> list[str]:
 
 
 def rows(readme: str) -> Iterator[tuple[str, list[str]]]:
-    """Each table row with the bold line above its table, as that line's first code; "" without one."""
+    """Each table row with the bold name above its table; "" without one."""
     title = ""
     for line in prose(readme).splitlines():
-        if line.startswith("**"):
+        if line.startswith("**`"):
             title = code(line)[0]
         elif line.startswith("#"):
             title = ""
@@ -91,9 +89,10 @@ def test_both_languages_have_the_same_sections_examples_and_tables() -> None:
 
 @READMES
 def test_ten_minutes_of_reading(readme: str) -> None:
-    [many] = MANY_BROKERS.findall(readme)
-    assert _words(readme) - _words(many) <= 2300
+    [many], [protocols] = MANY_BROKERS.findall(readme), PROTOCOLS_TOLD.findall(readme)
+    assert _words(readme) - _words(many) - _words(protocols) <= 2300
     assert _words(many) <= 650
+    assert _words(protocols) <= 600
 
 
 def _words(text: str) -> int:
@@ -164,8 +163,29 @@ def test_every_adapter_and_protocol_is_told(readme: str) -> None:
     ours = {name for name in adapter_names() if adapter_class(name).__module__.startswith("psiu_adapters.")}
     for name in ours:
         assert f'adapter = "{name}"' in code(readme)
-    for name in CODECS:
-        assert f'protocol = "{name}"' in code(readme)
+    [protocols] = PROTOCOLS_TOLD.findall(readme)
+    assert {code(row[0])[0] for _, row in rows(protocols) if code(row[0])} == set(PROTOCOLS)
+
+
+@READMES
+def test_every_example_of_a_protocol_is_linked(readme: str) -> None:
+    folder = TREE / "deploy/examples/protocols"
+    linked = set(re.findall(r"\((deploy/examples/protocols/\S+)\)", readme))
+    assert linked == {str(file.relative_to(TREE)) for file in folder.glob("*.toml")}
+
+
+@READMES
+def test_the_tables_for_protocols_load(readme: str, tmp_path: Path) -> None:
+    [protocols] = PROTOCOLS_TOLD.findall(readme)
+    marcha, painel = blocks(protocols, "toml")
+    file = tmp_path / "broker.toml"
+    body = '[links.corpo]\nadapter = "serial"\ndevice = "/dev/corpo"\nprotocol = "mitya"\n'
+    radio = '[links.radio]\nadapter = "serial"\ndevice = "/dev/radio"\nprotocol = "psiu-ascii"\n'
+    robots = '[robots.MITYA]\nlink = "corpo"\n[robots.MNERIM]\nlink = "radio"\n'
+    file.write_text("\n".join(['[broker]\nname = "base"', body, radio, painel, robots, marcha]))
+    configuration = load(file)
+    assert configuration.links["painel"].options.plays == "MNERIM"
+    assert set(configuration.robots["MITYA"].options.commands) == {"marcha"}
 
 
 @READMES
@@ -204,6 +224,7 @@ def test_the_messages_are_real(readme: str) -> None:
     Answer.model_validate(answer, extra="forbid")
     Refusal.model_validate(refusal, extra="forbid")
     assert set(decoded) == set(Decoded.model_fields)
+    assert set(answer) == set(Answer.model_fields)
     assert bytes.fromhex(decoded["wire"]) == b"base 040 parafrente sucesso MNERIM 03012"
 
 
