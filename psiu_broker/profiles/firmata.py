@@ -203,9 +203,9 @@ class FirmataProfile(Profile):
         return False
 
     def describe(self, frame: Frame) -> Description:
-        message = read(frame.payload)
         if frame.subject.startswith(_TOLD):
-            return {"kind": "command", "command": frame.subject, "parameters": _parameters(message)}
+            return {"kind": "command", "command": frame.subject, "parameters": _parameters(_first(frame.payload))}
+        message = read(frame.payload)
         told: Description = {"kind": "event", "command": frame.subject, "parameters": _parameters(message)}
         match message:
             case AnalogMessage(channel, raw):
@@ -480,3 +480,11 @@ def _parameters(message: Message | None) -> list[Value]:  # noqa: PLR0911 - one 
 
 def _shown(parameters: Sequence[Value]) -> str:
     return " ".join(str(value) for value in parameters) or "nothing"
+
+
+def _first(payload: bytes) -> Message | None:
+    """The first of the messages that a program says in one go, which a question about its outcome may follow."""
+    try:
+        return read(firmata.messages(payload, "host")[0])
+    except EncodeError:
+        return None

@@ -490,3 +490,10 @@ def test_whatever_a_board_says_nothing_is_raised(said: list[bytes], data: st.Dat
                 robot.read(request, heard)
     assert robot.greeting()
     assert robot.commands()
+
+
+def test_an_order_is_told_with_its_parameters_though_a_question_follows_it() -> None:
+    robot = profile({"farol": {"pin": 13, "mode": "output"}})
+    request = robot.request("farol", ["on"])
+    sent = Frame(NOBODY, NOBODY, request.subject, request.payload, "firmata")
+    assert robot.describe(sent)["parameters"] == [1]
