@@ -24,7 +24,7 @@ class Receiver(Protocol):
     """The broker's end of a transport. None of these waits or raises."""
 
     def received(self, data: bytes, peer: Peer, /) -> None:
-        """Bytes from `peer`: any piece of a stream, or exactly one datagram."""
+        """Bytes from `peer`: any piece of a stream, or exactly one datagram. An empty piece: `peer` has come."""
 
     def writable(self) -> None:
         """After a refused `Transport.write`: there is room again."""

@@ -89,6 +89,8 @@ class Resident(Protocol):
 
     def link_closed(self, link: Link, now: float) -> None: ...
 
+    def peer_came(self, way: Way, now: float) -> None: ...
+
     def peer_lost(self, way: Way, now: float) -> None: ...
 
 
@@ -278,6 +280,9 @@ class Exchange:
     def closed(self, link: Link, now: float) -> None:
         self.router.link_down(link.name, now)
         self.resident.link_closed(link, now)
+
+    def peer_came(self, way: Way, now: float) -> None:
+        self.resident.peer_came(way, now)
 
     def peer_lost(self, way: Way, now: float) -> None:
         self.router.peer_lost(way, now)

@@ -45,6 +45,7 @@ class Hub(Protocol):
     def settled(self, fate: Fate, verdict: Verdict, now: float) -> None: ...
     def opened(self, link: "Link", now: float) -> None: ...
     def closed(self, link: "Link", now: float) -> None: ...
+    def peer_came(self, way: Way, now: float) -> None: ...
     def peer_lost(self, way: Way, now: float) -> None: ...
 
 
@@ -105,6 +106,9 @@ class Link(Kept):
         now = self._clock()
         self.pause_s = FIRST_PAUSE_S
         end = self._ends.get(peer) or self._end(peer)
+        if not data:
+            self._hub.peer_came(end.way, now)
+            return
         codec = end.codec
         frame = None if codec.pending else codec.whole(data)
         if frame is not None and self._askers is None:

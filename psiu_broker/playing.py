@@ -87,6 +87,10 @@ class Playing:
     def link_closed(self, link: str) -> None:
         self._forget([way for way in self._programs if way.link == link])
 
+    def peer_came(self, way: Way, now: float) -> None:
+        """A program has come, before it says anything."""
+        self._program(way, now)
+
     def peer_lost(self, way: Way) -> None:
         self._forget([each for each in self._programs if each == way])
 

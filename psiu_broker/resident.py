@@ -149,6 +149,9 @@ class Resident:
         self._playing.link_closed(link.name)
         self._conversations.link_down(link.name, link.reason or "closed")
 
+    def peer_came(self, way: Way, now: float) -> None:
+        self._playing.peer_came(way, now)
+
     def peer_lost(self, way: Way, now: float) -> None:
         self._playing.peer_lost(way)
         self._conversations.link_down(way.link, "its far end is gone", way.peer)

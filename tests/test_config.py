@@ -278,7 +278,7 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         ),
         (
             RADIO.replace('"psiu-ascii"', '"psiu-asci"'),
-            'links.radio.protocol: expected one of amarino, firmata, mitya, psiu-ascii, psiu-hexa, soccer, got',
+            "links.radio.protocol: expected one of amarino, firmata, mitya, psiu-ascii, psiu-hexa, soccer, got",
         ),
         ("[links]\nradio = 3", "links.radio: expected a table, got 3; write [links.radio] above its keys"),
         (
@@ -482,6 +482,11 @@ def test_a_robot_s_name_is_not_an_address(problems):
             id="a map of letters that there are not",
         ),
         pytest.param(
+            CORPO.replace("mitya", "firmata") + 'role = "host"\nplays = "A"\n' + RADIO + '[robots.A]\nlink="radio"',
+            'links.corpo.role: programs find a board there, got "host"; remove it',
+            id="a program is told of a robot by another program",
+        ),
+        pytest.param(
             CAMPO + "rate_hz = 300",
             "links.campo.rate_hz: 300 packets/s × 8 bytes × 10 bits = 24000 bit/s, the line carries 19200;",
             id="a rate that the line cannot carry",
@@ -596,6 +601,11 @@ def test_two_names_of_one_device_are_noticed(problems, tmp_path):
     two = RADIO.replace("/dev/serial/by-id/radio", str(tmp_path / "by-id")).replace("links.radio", "links.two")
     (line,) = problems(BROKER + one + two)
     assert line.startswith("links.two.device: ")
+
+
+def test_a_link_that_plays_a_robot_is_the_board_s_side(read):
+    text = BROKER + CORPO.replace("mitya", "firmata") + 'plays = "A"\n' + RADIO + '[robots.A]\nlink="radio"'
+    assert read(text).links["corpo"].codec.role == "board"
 
 
 def test_every_mistake_is_told_at_once(problems):

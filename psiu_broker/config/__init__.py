@@ -3,23 +3,27 @@
 from psiu_broker.config.reading import load
 from psiu_broker.config.schema import json_schema
 from psiu_broker.config.tables import (
+    AccessConfiguration,
     BrokerConfiguration,
     Configuration,
     LinkConfiguration,
     LinkOptions,
     MeshConfiguration,
     RobotConfiguration,
+    TlsConfiguration,
     TrunkConfiguration,
     ZenohConfiguration,
 )
 
 __all__ = [
+    "AccessConfiguration",
     "BrokerConfiguration",
     "Configuration",
     "LinkConfiguration",
     "LinkOptions",
     "MeshConfiguration",
     "RobotConfiguration",
+    "TlsConfiguration",
     "TrunkConfiguration",
     "ZenohConfiguration",
     "json_schema",

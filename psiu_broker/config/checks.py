@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from datetime import datetime
 from ipaddress import ip_address
 from typing import Final
 
@@ -10,11 +11,15 @@ from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.codecs.soccer import Soccer, rate_trouble
+from psiu_broker.config.certificates import problem
+from psiu_broker.config.certificates import warnings as validity
 from psiu_broker.config.problems import Key, Problems, got, suggestion
 from psiu_broker.config.tables import (
     ENDPOINT,
+    AccessConfiguration,
     BrokerConfiguration,
     LinkConfiguration,
+    MeshConfiguration,
     RobotConfiguration,
     TrunkConfiguration,
     ZenohConfiguration,
@@ -26,6 +31,9 @@ from psiu_broker.protocols import PROTOCOLS
 _WORD: Final = re.compile(r"[!-~]+")
 _NUMBERED_TTY: Final = re.compile(r"/dev/tty(USB|ACM)[0-9]+")
 _EVERY_INTERFACE: Final = frozenset({"0.0.0.0", "[::]"})  # noqa: S104 (compared, not bound)
+_ADD_TLS: Final = "write [zenoh.tls] with ca, certificate and key, which psiu-broker keys makes"
+_PROTECT_RATHER: Final = "keep to 127.0.0.1, or to tls/ with [zenoh.tls] and [zenoh.access]"
+_PROTECT: Final = f"{_PROTECT_RATHER}, or say unprotected = true in [zenoh]"
 
 
 def check_nodes(nodes: Mapping[str, Node], key: Key, problems: Problems) -> None:
@@ -188,14 +196,73 @@ def _check_played(
         problems.add(key, text)
 
 
-def warnings_about(file: str, zenoh: ZenohConfiguration, links: Iterable[LinkConfiguration]) -> tuple[str, ...]:
-    warnings = Problems(file)
+def check_bus(zenoh: ZenohConfiguration, mesh: MeshConfiguration, problems: Problems) -> None:
+    """Nobody comes to the bus from another computer unseen, unless the user says so."""
+    access, protected = zenoh.access, zenoh.tls is not None and zenoh.access is not None
+    if access is not None and zenoh.tls is None:
+        problems.add(("zenoh", "access"), f"the names are those of certificates, and there are none; {_ADD_TLS}")
+    if access is not None:
+        _check_roles(access, problems)
+    for key, endpoint in _endpoints(zenoh, mesh):
+        if endpoint.startswith("tls/"):
+            if zenoh.tls is None:
+                problems.add(key, f"{got(endpoint)} needs a key; {_ADD_TLS}")
+                continue
+        elif access is not None:
+            text = f"expected tls/HOST:PORT, got {got(endpoint)}, where nobody shows the certificate that access asks"
+            problems.add(key, f"{text}; write tls/ in place of {endpoint.partition('/')[0]}/")
+            continue
+        if not (_is_loopback(endpoint) or protected or zenoh.unprotected):
+            problems.add(key, f"{endpoint} lets every computer that reaches it move the robots; {_PROTECT}")
+    if mesh.discover and not (protected or zenoh.unprotected):
+        text = "whoever answers on the local network may move the robots"
+        problems.add(("mesh", "discover"), f"{text}; {_PROTECT}")
+
+
+def _check_roles(access: AccessConfiguration, problems: Problems) -> None:
+    roles: dict[str, str] = {}
+    for role in type(access).model_fields:
+        for position, name in enumerate(getattr(access, role)):
+            if (first := roles.setdefault(name, role)) != role:
+                text = f"{got(name)} is one of {first} already; name it once"
+                problems.add(("zenoh", "access", role, position), text)
+
+
+def _endpoints(zenoh: ZenohConfiguration, mesh: MeshConfiguration) -> Iterator[tuple[Key, str]]:
     for position, endpoint in enumerate(zenoh.listen):
-        if not _is_loopback(endpoint):
-            warnings.add(
-                ("zenoh", "listen", position),
-                f"{endpoint} lets every computer that reaches it move the robots; tcp/127.0.0.1:7447 does not",
-            )
+        yield ("zenoh", "listen", position), endpoint
+    for position, endpoint in enumerate(mesh.connect):
+        yield ("mesh", "connect", position), endpoint
+
+
+def check_keys(zenoh: ZenohConfiguration, problems: Problems) -> None:
+    """The files of ``[zenoh.tls]`` are there, belong together, and are the broker's alone."""
+    if zenoh.tls is not None and (found := problem(zenoh.tls)) is not None:
+        option, text = found
+        problems.add(("zenoh", "tls", option), text)
+
+
+def warnings_about(
+    file: str,
+    zenoh: ZenohConfiguration,
+    mesh: MeshConfiguration,
+    links: Iterable[LinkConfiguration],
+    trunks: Iterable[TrunkConfiguration],
+    now: datetime,
+) -> tuple[str, ...]:
+    warnings = Problems(file)
+    for key, endpoint in _endpoints(zenoh, mesh):
+        if not _is_loopback(endpoint) and zenoh.access is None:
+            warnings.add(key, f"{endpoint} lets every computer that reaches it move the robots; {_PROTECT_RATHER}")
+    if mesh.discover and zenoh.access is None:
+        text = "whoever answers on the local network may move the robots"
+        warnings.add(("mesh", "discover"), f"{text}; {_PROTECT_RATHER}")
+    if zenoh.tls is not None:
+        for option, text in validity(zenoh.tls, now):
+            warnings.add(("zenoh", "tls", option), text)
+    for trunk in trunks if zenoh.access is not None else ():
+        text = "whoever is at its far end counts as a broker, and shows no certificate"
+        warnings.add(("trunks", trunk.name), f"{text}; see that nobody else reaches it")
     for link in links:
         device = getattr(link.adapter, "device", None)
         if isinstance(device, str) and _NUMBERED_TTY.fullmatch(device):

@@ -5,6 +5,7 @@ protocol's codec and to the link itself, and are split among those three here.
 import re
 import tomllib
 from collections.abc import Collection, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,10 +15,12 @@ from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.codecs.soccer import Soccer
 from psiu_broker.config.checks import (
+    check_bus,
     check_devices,
     check_ends,
     check_far_end,
     check_identities,
+    check_keys,
     check_nodes,
     check_rate,
     check_trunk,
@@ -45,6 +48,9 @@ from psiu_broker.profiles.persona import PersonaOptions
 from psiu_broker.protocols import CODECS, PROTOCOLS
 from psiu_broker.registry import UnknownAdapter, adapter_class, adapter_names
 
+PLAYED_ROLE: Final = "board"
+"""What the broker is on a link that plays a robot, in protocols that have two sides."""
+
 _ROBOT_WORDS: Final = frozenset(RobotTable.model_fields).union(
     *(protocol.profile.Options.model_fields for protocol in PROTOCOLS.values())
 )
@@ -58,7 +64,7 @@ def load(path: Path) -> Configuration:
     """
     problems = Problems(str(path))
     try:
-        configuration = _configuration(_document(path), str(path), problems)
+        configuration = _configuration(_document(path), path, problems)
     except RecursionError as error:
         raise ConfigurationError([f"{path}: tables or lists nested too deeply; no option needs that"]) from error
     if configuration is None:
@@ -89,7 +95,7 @@ def _syntax(path: Path, message: str) -> str:
     return f"{path}{place}: not TOML: {what}{hint}"
 
 
-def _configuration(document: dict[str, Any], file: str, problems: Problems) -> Configuration | None:
+def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> Configuration | None:
     """What the file says; None where it is wrong, with every mistake noted."""
     sections = ("broker", "zenoh", "mesh", "links", "trunks", "robots")
     for name in document:
@@ -111,10 +117,22 @@ def _configuration(document: dict[str, Any], file: str, problems: Problems) -> C
     if None not in links.values():
         check_ends(whole_links, whole_robots, problems)
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
+    if zenoh is not None and mesh is not None:
+        zenoh = _with_files(zenoh, file.parent)
+        check_bus(zenoh, mesh, problems)
+        check_keys(zenoh, problems)
     if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
-    warnings = warnings_about(file, zenoh, whole_links.values())
+    warnings = warnings_about(str(file), zenoh, mesh, whole_links.values(), trunks.values(), datetime.now(UTC))
     return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks, mesh)
+
+
+def _with_files(zenoh: ZenohConfiguration, folder: Path) -> ZenohConfiguration:
+    """The same with paths that hold wherever the broker runs: relative ones are so to the file's `folder`."""
+    if zenoh.tls is None:
+        return zenoh
+    files = {option: str(folder.absolute() / path) for option, path in zenoh.tls}
+    return zenoh.model_copy(update={"tls": zenoh.tls.model_copy(update=files)})
 
 
 def _link(
@@ -135,6 +153,10 @@ def _link(
         mine = _share(table, codec_model)
         if codec_model is PsiuHexa.Options:
             mine = _with_ends(name, mine, robots, own_address, problems)
+        if "role" in codec_model.model_fields and "plays" in table:
+            mine = {"role": PLAYED_ROLE} | mine
+            if mine["role"] != PLAYED_ROLE:
+                problems.add((*key, "role"), f"programs find a {PLAYED_ROLE} there, got {got(mine['role'])}; remove it")
         codec = problems.read(codec_model, mine, key)
         if adapter and isinstance(codec, PsiuHexa.Options):
             check_far_end(adapter, codec, table, key, problems)

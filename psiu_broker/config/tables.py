@@ -36,7 +36,7 @@ def _endpoint(endpoint: str) -> str:
     match = ENDPOINT.fullmatch(endpoint)
     if match is None or int(match["port"] or 0) > 65535:
         raise ValueError(
-            f"expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH), got {got(endpoint)};"
+            f"expected tcp/HOST:PORT (or tls/, udp/, ws/, unixsock-stream/PATH), got {got(endpoint)};"
             " write it like tcp/127.0.0.1:7447"
         )
     if match["port"] and int(match["port"]) == 0:
@@ -65,7 +65,7 @@ def _prefix(prefix: str) -> str:
 
 LINK_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 ENDPOINT: Final = re.compile(
-    r"(?:tcp|udp|ws)/(?P<host>\[[^\s\[\]]+\]|[^\s:/\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?|unixsock-stream/\S+"
+    r"(?:tcp|tls|udp|ws)/(?P<host>\[[^\s\[\]]+\]|[^\s:/\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?|unixsock-stream/\S+"
 )
 
 BrokerName = Annotated[str, AfterValidator(_broker_name)]
@@ -75,6 +75,13 @@ Endpoints = Annotated[
 ]
 Others = Annotated[tuple[Endpoint, ...], AfterValidator(_once), Field(json_schema_extra={"uniqueItems": True})]
 Prefix = Annotated[str, AfterValidator(_prefix)]
+File = Annotated[str, Field(min_length=1)]
+"""A path; where it is relative, from the folder of the configuration."""
+Names = Annotated[
+    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
+    AfterValidator(_once),
+    Field(json_schema_extra={"uniqueItems": True}),
+]
 Number = Annotated[int, Field(ge=0, le=255)]
 Seconds = Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)]
 
@@ -90,11 +97,30 @@ class BrokerConfiguration(_Table):
     address: Number = Field(0, description="the broker's own PSIU HEXA address")
 
 
+class TlsConfiguration(_Table):
+    """``[zenoh.tls]``: who the broker is to programs and other brokers, and whom it believes."""
+
+    ca: File = Field(description="the certificate of the authority that made all the others")
+    certificate: File = Field(description="the broker's own")
+    key: File = Field(description="of the certificate; nobody else may read it")
+
+
+class AccessConfiguration(_Table):
+    """``[zenoh.access]``: who may do what, by the names in their certificates; who is not named may do nothing."""
+
+    brokers: Names = Field((), description="other brokers, who may do everything")
+    commanders: Names = Field((), description="who may call robots, and listen")
+    listeners: Names = Field((), description="who may listen, and ask how things are")
+
+
 class ZenohConfiguration(_Table):
     """``[zenoh]``: where other programs find the broker."""
 
     listen: Endpoints = Field(("tcp/127.0.0.1:7447",), description="where programs connect")
     prefix: Prefix = Field("psiu", description="the first part of every key")
+    unprotected: bool = Field(False, description="let whoever reaches the broker from other computers do everything")
+    tls: TlsConfiguration | None = Field(None, description="keys, for endpoints that begin with tls/")
+    access: AccessConfiguration | None = Field(None, description="who may do what, by certificate")
 
 
 class MeshConfiguration(_Table):

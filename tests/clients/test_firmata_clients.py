@@ -216,6 +216,14 @@ class TestFirmataIo:
             await lab.until(lambda: {"touch": 1} in program.said)
         assert lab.arm.signals[4] == 42
 
+    async def test_it_is_greeted_as_by_a_board_that_was_reset(self, lab: Lab) -> None:
+        async with running(lab.board) as program:
+            await lab.until(lambda: any(link.details.get("program") == "here" for link in lab.broker.links()))
+            begun = time.monotonic()
+            await lab.until(lambda: program.said)
+            # Without a greeting it would ask of its own accord, five seconds later.
+            assert time.monotonic() - begun < 4.5
+
     async def test_programs_may_follow_one_another_and_a_lock_is_gone_with_who_had_it(self, lab: Lab) -> None:
         for angle in (1, 2):
             lab.arm.signals[4] = angle
