@@ -71,6 +71,8 @@ BURST_S: Final = 1.0
 
 _MESSAGE: Final = re.compile(rb"[A-Za-z#*~=][0-9A-Fa-f]{4}")
 _DIGITS: Final = frozenset(b"0123456789ABCDEFabcdef")
+_REALIGNING: Final = re.compile(rb"0?W0000")
+"""The question of a realignment, and the filler that may go before it."""
 _LINE_END: Final = frozenset(b"\r\n")
 _LATIN: Final = frozenset(b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz")
 _HELD: Final = 4 * MESSAGE_BYTES
@@ -178,7 +180,7 @@ class Mitya(Codec):
         """
         if frame.protocol != PROTOCOL:
             raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
-        if frame.subject == REALIGN:
+        if frame.subject == REALIGN and _REALIGNING.fullmatch(frame.payload):
             return frame.payload
         if not is_message(frame.payload):
             raise EncodeError(f"{frame.payload!r} is not a letter and four hexadecimal digits")
@@ -202,7 +204,7 @@ class Mitya(Codec):
         if word == STOP:
             return BY_WORD[self.version]["drive"]
         if word.startswith(LETTER):
-            if payload[0] in self._letters:
+            if payload[0] in self._letters and chr(payload[0]) not in LETTERS[self.version]:
                 return chr(payload[0])
         elif (letter := BY_WORD[self.version].get(word)) is not None:
             return letter

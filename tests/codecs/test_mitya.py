@@ -112,6 +112,11 @@ def test_a_burst_of_a_one_shot_is_one_event_whatever_was_lost_of_it() -> None:
     assert payloads(read(codec(datagrams=True), *fire, *fire)) == [b"f0001", b"f0001"]
 
 
+def test_a_burst_goes_on_as_long_as_each_message_follows_the_last_soon() -> None:
+    one = codec()
+    assert [payloads(read(one, b"y0001", now=now * BURST_S)) for now in (0, 0.9, 1.8, 2.7)] == [[b"y0001"], [], [], []]
+
+
 def test_set_points_between_the_messages_of_a_burst_do_not_end_it() -> None:
     heard = read(codec(), b"y0001", b"D0064", b"y0001", b"D0064", b"y0000", b"D0065", b"y0000")
     assert payloads(heard) == [b"y0001", b"D0064", b"D0064", b"D0065"]
@@ -183,6 +188,11 @@ def test_a_message_of_another_version_is_said_by_its_word(
         ("2013", "2014", b"r0000"),
         ("2012", "2014", b"W0000"),
         ("2012", "2013", b"A0001"),
+        ("2012", "2013", b"G0064"),
+        ("2012", "2014", b"M0001"),
+        ("2014", "2012", b"r0103"),
+        ("2014", "2012", b"r0200"),
+        ("2014", "2013", b"W0001"),
     ],
 )
 def test_what_a_version_has_no_letter_for_is_refused(there: Version, here: Version, came: bytes) -> None:
@@ -228,6 +238,9 @@ def test_a_recording_ends_with_its_end_or_with_anything_out_of_order(spoiler: by
 
 def test_a_frame_that_finds_the_step_is_sent_as_it_is() -> None:
     assert codec().encode(said(REALIGN, b"0W0000")) == b"0W0000"
+    for other in (b"", b"D0064", b"00W0000", b"0W0000D0064"):
+        with pytest.raises(EncodeError):
+            codec().encode(said(REALIGN, other))
 
 
 def test_a_stop_is_a_speed_of_0() -> None:
@@ -284,6 +297,27 @@ def test_half_a_message_is_given_up_after_a_silence() -> None:
     assert one.pending
     assert list(one.flush(0.05)) == [Malformed("unfinished", b"L00", 3)]
     assert payloads(read(one, b"L00FF")) == [b"L00FF"]
+
+
+@pytest.mark.parametrize("after", ["silence", "\n"])
+def test_in_step_again_a_message_is_read_as_soon_as_it_is_whole(after: str) -> None:
+    one = codec()
+    one.decode(b"!0", 0.0)
+    if after == "silence":
+        one.flush(0.1)
+    else:
+        one.decode(after.encode(), 0.0)
+    assert payloads(list(one.decode(b"D0064", 0.2))) == [b"D0064"]
+
+
+def test_lower_digits_are_passed_on_in_capitals() -> None:
+    (frame,) = frames(read(codec(), b"L00ff"))
+    assert frame.dialect != codec().dialect  # else its bytes are sent as they came
+    assert codec().encode(frame) == b"L00FF"
+
+
+def test_a_one_shot_after_a_recording_is_none_of_a_burst_before_it() -> None:
+    assert payloads(read(codec(), b"y0001", b"r0100Z0000", b"y0001"))[-1] == b"y0001"
 
 
 def test_endless_noise_is_reported_and_kept_small() -> None:
