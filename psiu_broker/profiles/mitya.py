@@ -19,7 +19,7 @@ from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Value
 from psiu_broker.profiles.profile import SENT, Description, Profile, Reading, Reply, Request, RobotOptions
 from psiu_broker.profiles.psiu import COUNT, NAME, SHOW, SHOW_PRINTED, typed
-from psiu_broker.routing.outbox import is_stop
+from psiu_broker.routing.outbox import STOP_WORDS, is_stop
 
 __all__ = ["ERRORS", "MOODS", "MityaCommand", "MityaProfile", "Realigner", "meaning"]
 
@@ -53,7 +53,7 @@ FILLERS: Final = 5
 PLAY: Final = "play"
 
 _STOPS: Final = ("pare",)
-_RESERVED: Final = frozenset({NAME, COUNT, SHOW, SHOW_PRINTED})
+_RESERVED: Final = STOP_WORDS | {NAME, COUNT, SHOW, SHOW_PRINTED}
 _SAID_BY_ROBOTS: Final = frozenset({"error", "telemetry", "hit"})
 _RECORDED_ONLY: Final = frozenset({"room", "wait"})
 _LOW, _HIGH = -0x8000, 0xFFFF
@@ -182,9 +182,9 @@ class Realigner:
 
     ``W0000`` is no command outside a script: a body in step objects with E0007, one out of step with E0001, since to
     it W stands for a digit. So it is asked, and after each E0001 asked again behind one more byte, five times at most.
-    What makes it begin is an E0001, or an E0002, which a command that is cut at a wrong place may cause too. An E0001
-    ends any recording, so that nothing asked after it disturbs one. It needs no clock: an answer that does not come is
-    not waited for.
+    What makes it begin is any other error: an E0002 may be a command cut at a wrong place, and E0003 to E0006 end a
+    recording, which noise may have begun. E0001 ends one too, so that nothing asked after these disturbs one. It needs
+    no clock: an answer that does not come is not waited for.
     """
 
     def __init__(self) -> None:
@@ -212,7 +212,7 @@ class Realigner:
         code = mitya.number(frame.payload)
         if not self.asking:
             self._taken = None
-            return code in (0x01, 0x02)
+            return 0 < code < 0x07
         if code in (0x04, 0x06, 0x07):  # W was read as a letter, by a body that was recording or not
             self.asking, self.in_step, self._taken = False, True, frame
         elif code == 0x01:
@@ -314,7 +314,7 @@ class MityaProfile(Profile):
             return None if self._answers else Reply(None, self._volts, "V")
         if frame.subject == "error":
             code = mitya.number(frame.payload)
-            if code == 0x07 and request.subject not in (SCRIPT + "wait", SCRIPT + "room"):
+            if code == 0x07:
                 return None  # an answer to W0000, which is no command of ours
             return self._last_of_burst(request, frame)
         if frame.subject == DONE:
@@ -443,7 +443,7 @@ def _forms(version: Version) -> dict[str, _Form]:
 
 
 def _own(name: str, command: MityaCommand, version: Version) -> _Form:
-    if name in _RESERVED or not name.isascii() or not name.isprintable() or " " in name or not name:
+    if name in _RESERVED or is_stop(name) or not name.isascii() or not name.isprintable() or " " in name or not name:
         taken = ", ".join(sorted(_RESERVED))
         raise ValueError(f"commands.{name}: expected one word, none of {taken}; call it something else")
     word = LETTERS[version].get(command.letter, mitya.LETTER + command.letter)
@@ -476,6 +476,8 @@ def _number(value: Value, names: Mapping[str, int]) -> int | float | None:
             except ValueError:
                 return None
         value = typed(value)
+    if isinstance(value, int):
+        return value  # however great
     return None if isinstance(value, str) or not math.isfinite(value) else value
 
 

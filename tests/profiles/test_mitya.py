@@ -1,7 +1,7 @@
 """Robot Mitya as callers see it: calls by letter or name, answers, errors in words, and how a body finds its step."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +99,7 @@ def test_a_call_becomes_a_message(version: Version, command: str, parameters: li
         ("drive", [1.5], "drive takes -255 to 255, got 1.5"),
         ("drive", ["0xZZ"], "drive takes -255 to 255, got 0xZZ"),
         ("drive", [float("nan")], "drive takes -255 to 255, got nan"),
+        ("drive", [10**400], f"drive takes -255 to 255, got {10**400}"),
         ("drive", [float("inf")], "drive takes -255 to 255, got inf"),
         ("H", [181], "H takes 0 to 180 deg, got 181"),
         ("V", [-1], "V takes 0 to 90 deg, got -1"),
@@ -193,6 +194,13 @@ def test_of_a_one_shot_both_messages_are_answered_and_the_call_waits_for_both() 
     reply = robot.read(again, heard("#0000", "2013"))
     assert isinstance(reply, Reply)
     assert (reply.status, reply.values) == ("falha", ("#0002",))
+
+
+def test_where_a_one_shot_is_sent_more_often_more_answers_are_awaited() -> None:
+    robot = profile("2013", repeat=2)
+    request = robot.request("fire", [])
+    replies = [robot.read(request, heard("#0000", "2013")) for _ in range(4)]
+    assert replies == [None, None, None, Reply("sucesso")]
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -327,6 +335,8 @@ class TestCommandsOfTheUser:
         [
             ("2012", "qualseunome", "D", "expected one word"),
             ("2012", "two words", "D", "expected one word"),
+            ("2012", "stop", "Q", "expected one word"),
+            ("2012", "Pare", "D", "expected one word"),
             ("2012", "espera", "W", "is for scripts"),
             ("2012", "grava", "r", "is for scripts"),
             ("2013", "marcha", "D", "is a digit to a robot of 2013"),
@@ -335,6 +345,14 @@ class TestCommandsOfTheUser:
     def test_what_does_not_suit_the_robot_is_refused(self, version: Version, name: str, letter: str, text: str) -> None:
         with pytest.raises(ValueError, match=text):
             profile(version, commands={name: {"letter": letter}})
+
+
+LOST_AT_MOST = 3
+"""Commands that a body may take for something else before it says that it is out of step, or was recording."""
+
+
+def frames_of(codec: Mitya, data: bytes) -> list[Frame]:
+    return [event for event in codec.decode(data, 0.0) if isinstance(event, Frame)]
 
 
 class Line:
@@ -390,15 +408,55 @@ class TestRealignment:
     @given(st.binary(max_size=30), st.lists(st.binary(max_size=3), max_size=4))
     def test_whatever_was_lost_it_is_found_in_the_end(self, pending: bytes, strays: list[bytes]) -> None:
         line = Line(pending)
-        line.body.recording = None  # else it may go on recording, of which it says nothing
         line.greet()
         for stray in strays:
             line.body.receive(stray, 0.0)
-            line.body.recording = None
             line.send(line.robot.request("D", [1]))
-        line.send(line.robot.request("D", [1]))
+        for _ in range(LOST_AT_MOST):
+            line.send(line.robot.request("D", [1]))
         line.send(line.robot.request("L", [7]))
         assert line.body.body.left == 7
+        assert line.body.recording is None
+
+    def test_a_recording_that_noise_began_is_found_out_and_ended(self) -> None:
+        line = Line()
+        line.greet()
+        line.body.receive(b"r", 0.0)
+        said: list[bytes] = []
+        for _ in range(3):  # rD000 begins it, 1D000 is an action and another one no delay
+            said += [frame.payload for frame in line.send(line.robot.request("D", [1]))]
+        assert said[:2] == [b"E0004", b"r0200"]
+        line.send(line.robot.request("L", [7]))
+        assert (line.body.recording, line.body.body.left) == (None, 7)
+
+    @pytest.mark.parametrize("lost", ["0", "00", "000", "0000"])
+    def test_all_that_it_says_while_it_is_sought_answers_no_call(self, lost: str) -> None:
+        line = Line(lost.encode())
+        request = line.robot.request("D", [100])
+        said = [frame.payload for frame in self._sought(line) if line.robot.read(request, frame) is None]
+        assert len(said) == 7 - len(lost)
+        assert said[-2:] == [b"E0002", b"E0007"]
+
+    @staticmethod
+    def _sought(line: "Line") -> Iterator[Frame]:
+        """What the body says, one by one, until it has found its step."""
+        waiting = list(line.robot.greeting())
+        while waiting:
+            asked = waiting.pop(0)
+            wire = line.codec.encode(Frame(NOBODY, NOBODY, asked.subject, asked.payload, "mitya"))
+            for _, data in line.body.receive(wire, 0.0):
+                for frame in frames_of(line.codec, data):
+                    if line.robot.learn(frame):
+                        waiting += line.robot.greeting()
+                    yield frame
+
+    def test_an_answer_that_comes_after_the_next_call_is_not_its(self) -> None:
+        robot = profile()
+        robot.greeting()
+        request = robot.request("D", [1])
+        late = heard("E0007")
+        assert not robot.learn(late)
+        assert robot.read(request, late) is None
 
     def test_what_answers_a_question_of_ours_answers_no_call(self) -> None:
         robot = profile()
