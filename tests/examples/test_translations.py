@@ -13,7 +13,7 @@ import pytest
 from ports import free_port
 from test_protocols import Lab, lab, message, until
 
-from psiu_broker.simulator import AsciiRobot, HexaRobot, PtyPort
+from psiu_broker.simulator import AsciiRobot, Extra, HexaRobot, PtyPort
 from psiu_broker.simulator.mitya import MityaBody
 
 FILE = Path(__file__).parents[2] / "deploy/examples/protocols/translations.toml"
@@ -34,7 +34,8 @@ class Stage(NamedTuple):
 @pytest.fixture
 async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     """Everything of the file, on pseudo-terminals and a free port."""
-    mnerim, mitya = AsciiRobot("MNERIM", per_unit_s=0.0), MityaBody("MITYA", version="2012")
+    mnerim = AsciiRobot("MNERIM", per_unit_s=0.0, extras=[Extra("pare")])
+    mitya = MityaBody("MITYA", version="2012")
     arm = HexaRobot(0x12, topology="point-to-point", actuators=(4, 5), sensors={7: 50, 8: 0})
     radio, corpo, line = (
         PtyPort(robot, link=tmp_path / name) for robot, name in ((mnerim, "radio"), (mitya, "corpo"), (arm, "arm"))
