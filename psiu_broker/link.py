@@ -20,8 +20,8 @@ from psiu_broker.errors import EncodeError
 from psiu_broker.frame import NOBODY, Address, Frame, Malformed, Way
 from psiu_broker.kept import FIRST_PAUSE_S, Kept
 from psiu_broker.routing.askers import Askers
-from psiu_broker.routing.outbox import Fate, Outbox, Parcel, lane
-from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, Verdict
+from psiu_broker.routing.outbox import STOP_LANE, Fate, Outbox, Parcel, lane
+from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, SUPERSEDED, Verdict
 
 WARNED_KEPT: Final = 256
 
@@ -131,7 +131,8 @@ class Link(Kept):
         self.expire(now)
         full: set[Peer] = set()
         while self._transport is not None and (parcel := self.outbox.take(full)) is not None:
-            if self._write(self._transport, parcel.wire, parcel.peer):
+            write = self._write_pieces if self._in_pieces else self._transport.write
+            if write(parcel.wire, parcel.peer):
                 self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
@@ -181,12 +182,17 @@ class Link(Kept):
                 return REFUSED
         if self._avr_limits:
             self._warn_of_avr(frame, wire)
-        if not (self.outbox.size and self.outbox.waits_for(peer)) and self._write(transport, wire, peer):
+        # Called at once where nothing is in pieces: nearly all that leaves goes this way.
+        write = self._write_pieces if self._in_pieces else transport.write
+        if not (self.outbox.size and self.outbox.waits_for(peer)) and write(wire, peer):
             self._sent(frame, wire, peer, now)
             return DELIVERED
         if self._transport is None:
             return LINK_DOWN
         parcel = Parcel(wire, peer, lane(frame), now + min(self._max_age_s, patience_s), fate or Fate(frame, arrived))
+        if parcel.lane == STOP_LANE:
+            for older in self.outbox.overtaken(parcel):
+                self._hub.settled(older.fate, SUPERSEDED, now)
         evicted = self.outbox.put(parcel)
         self._empty.clear()
         if evicted is parcel:
@@ -253,16 +259,14 @@ class Link(Kept):
         asker = self._askers.of(frame.source, now) if self._askers is not None else None
         return frame if asker is None else frame._replace(destination=asker)
 
-    def _write(self, transport: Transport, wire: bytes, peer: Peer) -> bool:
-        """As `Transport.write`; where a frame leaves in several datagrams, those after the first may be lost."""
-        if not self._in_pieces:
-            return transport.write(wire, peer)
+    def _write_pieces(self, wire: bytes, peer: Peer) -> bool:
+        """As `Transport.write`, for a frame that leaves in several datagrams: those after the first may be lost."""
         first, *rest = self.codec.pieces(wire) or (wire,)
-        if not transport.write(first, peer):
+        if self._transport is None or not self._transport.write(first, peer):
             return False
         for piece in rest:
             if self._transport is not None:
-                transport.write(piece, peer)
+                self._transport.write(piece, peer)
         return True
 
     def _warn_of_avr(self, frame: Frame, wire: bytes) -> None:

@@ -10,7 +10,7 @@ from psiu_broker import kept
 from psiu_broker import link as link_module
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.errors import LinkLost
-from psiu_broker.frame import Address, Frame, Malformed, Way
+from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way
 from psiu_broker.link import Link
 from psiu_broker.routing.outbox import Fate
 
@@ -183,11 +183,27 @@ async def test_a_stop_overtakes_what_waits(hub: Hub) -> None:
     transport = MemoryTransport()
     link = connected(hub, transport)
     transport.full = True
-    link.offer(command(), None, ARRIVED, 0.0)
+    link.offer(psiu_ascii.message(PC, Address.named("CARRO"), "parafrente", "100"), None, ARRIVED, 0.0)
     link.offer(psiu_ascii.message(PC, MNERIM, "pare"), None, ARRIVED, 0.0)
     transport.full = False
     link.writable()
     assert [wire.split()[2] for wire in transport.wires] == [b"pare", b"parafrente"]
+
+
+@pytest.mark.parametrize("everyone", [False, True])
+async def test_a_robot_that_is_stopped_is_not_moved_by_what_waited_before(hub: Hub, everyone: bool) -> None:
+    transport = MemoryTransport()
+    link = connected(hub, transport)
+    transport.full = True
+    link.offer(command(1), None, ARRIVED, 0.0)
+    link.offer(psiu_ascii.message(PC, EVERYONE if everyone else MNERIM, "pare"), None, ARRIVED, 0.0)
+    link.offer(command(2), None, ARRIVED, 0.0)
+    assert hub.fates == ["superseded"]
+    transport.full = False
+    link.writable()
+    assert [wire.split()[2:4] for wire in transport.wires[1:]] == [[b"parafrente", b"2"]]
+    assert b"pare" in transport.wires[0]
+    assert hub.fates == ["superseded", "delivered", "delivered"]
 
 
 async def test_what_waited_too_long_never_moves_a_robot(hub: Hub) -> None:

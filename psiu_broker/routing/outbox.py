@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator
 from itertools import chain
 from typing import Final, NamedTuple
 
-from psiu_broker.frame import Frame, Way
+from psiu_broker.frame import EVERYONE, Frame, Way
 from psiu_broker.routing.verdicts import DELIVERED, Verdict
 
 STOP_LANE: Final = 0
@@ -94,6 +94,17 @@ class Outbox:
         self._lanes[parcel.lane].append(parcel)
         self.size += 1
         return evicted
+
+    def overtaken(self, stop: Parcel) -> list[Parcel]:
+        """Take out what waits for the robot that `stop` is for and would, behind it, move it again."""
+        robot = stop.fate.frame.destination
+        return self._take_out(
+            lambda older: (
+                older.lane == COMMAND_LANE
+                and older.peer == stop.peer
+                and robot in (EVERYONE, older.fate.frame.destination)
+            )
+        )
 
     def waits_for(self, peer: object) -> bool:
         """Whether anything waits for `peer`: then what comes later must wait behind it."""
