@@ -1,5 +1,5 @@
 from psiu_broker.frame import Address, Frame, Way
-from psiu_broker.routing.askers import Askers
+from psiu_broker.routing.askers import ROBOTS_KEPT, Askers
 from psiu_broker.routing.holding import Holding
 
 RADIO = Way("radio")
@@ -76,3 +76,13 @@ def test_an_answer_without_destination_is_for_the_last_who_asked_and_only_for_a_
     askers.note(arm, Address.numbered(2), 1.0)
     assert askers.of(arm, 2.5) == Address.numbered(2)
     assert askers.of(arm, 3.1) is None
+
+
+def test_no_crowd_of_robots_makes_the_memory_of_who_asked_grow() -> None:
+    askers = Askers(window_s=2.0)
+    arm, pc = Address.named("ARM"), Address.named("PC")
+    for number in range(10_000):
+        askers.note(Address.named(f"R{number}"), pc, number / 1000)
+    askers.note(arm, pc, 10.0)
+    assert len(askers) <= ROBOTS_KEPT
+    assert askers.of(arm, 10.1) == pc
