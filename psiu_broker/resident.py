@@ -275,7 +275,8 @@ class Resident:
             if told is not None:
                 self._say(told)
         else:
-            if self._say(outcome(frame, name, answer)) == REFUSED:  # too long for the sender's protocol
+            told = outcome(frame, name, answer)
+            if told is not None and self._say(told) == REFUSED:  # too long for the sender's protocol
                 self._say(refusal(frame, name))
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:

@@ -105,11 +105,14 @@ def listing(frame: Frame, name: str, commands: Sequence[Command]) -> Frame | Non
     return _listing(words, frame, name, commands)
 
 
-def outcome(frame: Frame, name: str, answer: Answer) -> Frame:
+def outcome(frame: Frame, name: str, answer: Answer) -> Frame | None:
     """The answer of `name` to the ASCII command `frame`, from what a robot of another protocol answered to the call.
 
-    A field of no bytes is ``0x``; an answer that has no words is a refusal.
+    A field of no bytes is ``0x``; an answer that has no words is a refusal. None where the robot answers nothing:
+    the command alone would read as one to the sender, and what became of it nobody knows.
     """
+    if answer.status is None and not answer.values:
+        return None
     status = [] if answer.status is None else [answer.status]
     try:
         values = ["0x" if value == "" else text(value) for value in answer.values]

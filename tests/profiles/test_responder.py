@@ -205,19 +205,29 @@ def test_a_hexa_robots_nodes_are_listed_for_an_ascii_asker() -> None:
     assert told("qualseunome sucesso") is None
 
 
+def told(frame: Frame, name: str, answer: Answer) -> bytes | None:
+    said = outcome(frame, name, answer)
+    return None if said is None else said.payload
+
+
 def test_a_call_made_for_an_ascii_robot_is_answered_in_its_words() -> None:
     frame = ask("garra 45", Address.named("BRACO"))
-    assert outcome(frame, "BRACO", Answer(status="sucesso", elapsed_ms=1)).payload == b"garra sucesso"
-    assert outcome(frame, "BRACO", Answer(values=[42, 1.5], elapsed_ms=1)).payload == b"garra 42 1.5"
-    told = refusal(frame, "BRACO")
-    assert (told.source, told.destination, told.payload) == (Address.named("BRACO"), PC, b"garra falha")
+    assert told(frame, "BRACO", Answer(status="sucesso", elapsed_ms=1)) == b"garra sucesso"
+    assert told(frame, "BRACO", Answer(values=[42, 1.5], elapsed_ms=1)) == b"garra 42 1.5"
+    refused = refusal(frame, "BRACO")
+    assert (refused.source, refused.destination, refused.payload) == (Address.named("BRACO"), PC, b"garra falha")
 
 
 def test_an_answer_with_an_empty_field_or_without_words_is_still_an_answer() -> None:
     frame = ask("complex 0xa1b2", Address.named("BRACO"))
-    assert outcome(frame, "BRACO", Answer(values=["", "07"], elapsed_ms=1)).payload == b"complex 0x 07"
-    assert outcome(frame, "BRACO", Answer(values=["a b"], elapsed_ms=1)).payload == b"complex falha"
-    assert outcome(frame, "BRACO", Answer(values=[float("inf")], elapsed_ms=1)).payload == b"complex falha"
+    assert told(frame, "BRACO", Answer(values=["", "07"], elapsed_ms=1)) == b"complex 0x 07"
+    assert told(frame, "BRACO", Answer(values=["a b"], elapsed_ms=1)) == b"complex falha"
+    assert told(frame, "BRACO", Answer(values=[float("inf")], elapsed_ms=1)) == b"complex falha"
+
+
+def test_of_a_robot_that_does_not_answer_nothing_is_said_that_would_read_as_a_command() -> None:
+    frame = ask("drive 100", Address.named("MITYA"))
+    assert outcome(frame, "MITYA", Answer(remark="sent; this robot does not answer", elapsed_ms=1)) is None
 
 
 def test_a_robot_spoken_for_tells_its_name_to_one_asker_once_in_a_while_and_what_it_can_do_at_any_time() -> None:
