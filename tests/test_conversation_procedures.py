@@ -309,6 +309,14 @@ class TestSilence:
 
     @staticmethod
     @jumping
+    async def test_of_a_command_that_still_waits_nobody_is_told_that_it_was_sent() -> None:
+        body = Body(Robots())
+        body.robots.stuck = True
+        body.robots.expire = lambda link: None  # type: ignore[method-assign]
+        assert (await refused(body.call("drive", 100))).code == "outcome_unknown"
+
+    @staticmethod
+    @jumping
     async def test_a_command_that_did_not_leave_was_not_sent() -> None:
         body = Body(Robots())
         body.robots.stuck = True

@@ -300,7 +300,7 @@ class Conversations:
                 return reading, at
             elif reading is Notice.IMPOSSIBLE:
                 raise CallError("impossible", f"{call.robot.name} says that {call.command} is impossible")
-            elif reading is None and call.request.silence is not None:
+            elif reading is None and call.request.silence is not None and call.sent:
                 return call.request.silence, loop.time()
             elif reading is None and not call.request.question:
                 raise _outcome_unknown(call, loop.time())
