@@ -15,7 +15,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from psiu_broker.codecs import amarino
 from psiu_broker.codecs.amarino import ALIVE, LAST_FLAG, LONGEST_TEXT, TEXT, text_trouble, values, values_text
@@ -25,6 +25,7 @@ from psiu_broker.profiles.amarino import FLAG_PATTERN, NOT_REGISTERED, OUT_OF_BO
 from psiu_broker.profiles.persona import Call, Persona, PersonaOptions, Say
 from psiu_broker.profiles.profile import Description
 from psiu_broker.profiles.rarely import Rarely
+from psiu_broker.profiles.scaled_rule import ScaledRule
 
 __all__ = ["AmarinoPersona", "FlagRule"]
 
@@ -34,56 +35,32 @@ COMPLAIN_EVERY_S: Final = 5.0
 _UNSAYABLE: Final = re.compile(r"[;\x11-\x13\x1b]")
 
 
-class FlagRule(BaseModel):
+class FlagRule(ScaledRule):
     """What the robot is told when the phone sends one flag."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    command: str = Field(min_length=1, description="the robot's command")
-    scale: float | None = Field(
-        None, allow_inf_nan=False, description="what 1 from the phone is to the robot; left out: it takes no parameter"
-    )
-    offset: float = Field(0.0, allow_inf_nan=False, description="what 0 from the phone is to the robot")
-    minimum: float | None = Field(None, allow_inf_nan=False, description="a lower parameter is refused")
-    maximum: float | None = Field(None, allow_inf_nan=False, description="a greater parameter is refused")
-    decimals: int = Field(0, ge=0, le=6, description="digits behind the point; 0: the robot takes whole numbers")
     as_it_is: bool = Field(False, description="instead of a scale: every value, texts too, goes to the robot unchanged")
     stream: bool = Field(False, description="a set-point that comes again and again: only the newest counts")
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
-        if self.scale == 0:
-            raise ValueError("scale 0 tells the robot the same whatever the value; leave it out")
+    def _is_one_thing(self) -> Self:
         if self.scale is not None and self.as_it_is:
             raise ValueError("as_it_is and scale exclude each other; remove one")
-        if self.scale is None and (self.offset or self.minimum is not None or self.maximum is not None):
-            raise ValueError("offset, minimum and maximum mean nothing without a scale")
-        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            raise ValueError(f"minimum {self.minimum:g} is above maximum {self.maximum:g}")
         return self
 
     def parameters(self, told: Sequence[Value]) -> tuple[Value, ...]:
         """What the robot is told where the phone told `told`.
 
         Raises:
-            ValueError: it is no number, or the parameter is below `minimum` or above `maximum`.
+            ValueError: one is no number, or as `scaled`.
         """
         if self.as_it_is:
             return tuple(told)
-        return () if self.scale is None else tuple(self._parameter(value, self.scale) for value in told)
-
-    def _parameter(self, value: Value, scale: float) -> Value:
-        if isinstance(value, str):
-            raise ValueError(f"{value} is not a number")  # noqa: TRY004 - refused like any other value
-        parameter = value * scale + self.offset
-        if not math.isfinite(parameter):
-            raise ValueError(f"{value} is too great")
-        parameter = round(parameter, self.decimals)
-        if self.minimum is not None and parameter < self.minimum:
-            raise ValueError(f"{parameter:g} is below {self.minimum:g}")
-        if self.maximum is not None and parameter > self.maximum:
-            raise ValueError(f"{parameter:g} is above {self.maximum:g}")
-        return parameter if self.decimals else int(parameter)
+        parameters: list[Value] = []
+        for value in told if self.scale is not None else ():
+            if isinstance(value, str):
+                raise ValueError(f"{value} is not a number")  # noqa: TRY004 - refused like any other value
+            parameters += self.scaled(value)
+        return tuple(parameters)
 
 
 class AmarinoPersona(Persona):

@@ -12,7 +12,7 @@ Each line is a letter of the link's version, or its word, and what the robot is 
 from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from psiu_broker.codecs import mitya
 from psiu_broker.codecs.mitya import BY_WORD, DONE, LETTERS, ONE_SHOTS, SCRIPT, VERSIONS, Version
@@ -20,6 +20,7 @@ from psiu_broker.frame import Frame
 from psiu_broker.messages import Answer, Value
 from psiu_broker.profiles.persona import Call, Persona, PersonaOptions, Say
 from psiu_broker.profiles.rarely import Rarely
+from psiu_broker.profiles.scaled_rule import ScaledRule
 
 __all__ = ["MityaPersona", "Rule"]
 
@@ -35,53 +36,25 @@ _SET_POINTS: Final = frozenset({"left", "right", "drive", "head-horizontal", "he
 _STREAMED: Final = _SET_POINTS | {"tail", "mood", "headlights"}
 
 
-class Rule(BaseModel):
+class Rule(ScaledRule):
     """What the robot is told when the program sends one letter."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    command: str = Field(min_length=1, description="the robot's command")
     below_zero: str | None = Field(
         None, min_length=1, description="its command for values below 0, which then lose their sign"
     )
     at_zero: str | None = Field(None, min_length=1, description="its command for 0, without a parameter: a stop")
-    scale: float | None = Field(
-        None, allow_inf_nan=False, description="what 1 in the message is to the robot; left out: it takes no parameter"
-    )
-    offset: float = Field(0.0, allow_inf_nan=False, description="what 0 in the message is to the robot")
-    minimum: float | None = Field(None, allow_inf_nan=False, description="a lower parameter is refused")
-    maximum: float | None = Field(None, allow_inf_nan=False, description="a greater parameter is refused")
-    decimals: int = Field(0, ge=0, le=6, description="digits behind the point; 0: the robot takes whole numbers")
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        if self.scale == 0:
-            raise ValueError("scale 0 tells the robot the same whatever the value; leave it out")
-        if self.scale is None and (self.offset or self.minimum is not None or self.maximum is not None):
-            raise ValueError("offset, minimum and maximum mean nothing without a scale")
-        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            raise ValueError(f"minimum {self.minimum:g} is above maximum {self.maximum:g}")
-        return self
 
     def call(self, value: int) -> tuple[str, tuple[Value, ...]]:
         """The robot's command and parameters for a message's `value`.
 
         Raises:
-            ValueError: the parameter is below `minimum` or above `maximum`.
+            ValueError: as `scaled`.
         """
         if value == 0 and self.at_zero is not None:
             return self.at_zero, ()
-        command = self.command
         if value < 0 and self.below_zero is not None:
-            command, value = self.below_zero, -value
-        if self.scale is None:
-            return command, ()
-        parameter = round(value * self.scale + self.offset, self.decimals)
-        if self.minimum is not None and parameter < self.minimum:
-            raise ValueError(f"{parameter:g} is below {self.minimum:g}")
-        if self.maximum is not None and parameter > self.maximum:
-            raise ValueError(f"{parameter:g} is above {self.maximum:g}")
-        return command, (parameter if self.decimals else int(parameter),)
+            return self.below_zero, self.scaled(-value)
+        return self.command, self.scaled(value)
 
 
 class MityaPersona(Persona):

@@ -151,6 +151,10 @@ def test_a_value_that_the_map_does_not_allow_is_refused(version: Version, text: 
     assert Program(version).sends("H00B5") == [(text,)]
 
 
+def test_a_value_too_great_for_a_number_is_refused() -> None:
+    assert Program(rules={"D": {"command": "x", "scale": 1e308}}).sends("D0064") == [("E0101",)]
+
+
 @pytest.mark.parametrize(("version", "text"), [("2012", "E0105"), ("2013", "#0005")])
 def test_a_script_is_not_recorded_and_nothing_of_it_is_done(version: Version, text: str) -> None:
     drive = BY_WORD[version]["drive"]
