@@ -6,7 +6,8 @@
     y = {command = "acena"}
 
 Each line is a letter of the link's version, or its word, and what the robot is told. The value of the message times
-`scale`, plus `offset`, is the parameter; without a `scale` there is none. No scale is taken for granted.
+`scale`, plus `offset`, is the parameter; without a `scale` there is none. No scale is taken for granted. Of what the
+robot tells unasked, hits and the battery go to the program.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from psiu_broker.codecs.mitya import BY_WORD, DONE, LETTERS, ONE_SHOTS, SCRIPT, 
 from psiu_broker.frame import Frame
 from psiu_broker.messages import Answer, Value
 from psiu_broker.profiles.persona import Call, Persona, PersonaOptions, Say
+from psiu_broker.profiles.profile import Description
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.profiles.scaled_rule import ScaledRule
 
@@ -31,6 +33,8 @@ WRONG: Final = 0x01
 UNKNOWN: Final = 0x02
 NO_MEMORY: Final = 0x05
 _HEAD: Final = 0x0100
+
+_VOLTS_MOST: Final = 40.95
 
 _SET_POINTS: Final = frozenset({"left", "right", "drive", "head-horizontal", "head-vertical"})
 _STREAMED: Final = _SET_POINTS | {"tail", "mood", "headlights"}
@@ -114,6 +118,17 @@ class MityaPersona(Persona):
             return self._done()
         self._last.pop(word, None)  # it was not done: the same again is no repeat
         return self._complain(WRONG, word, now)
+
+    def told(self, description: Description, now: float) -> Sequence[Say]:
+        """A hit is passed on, and since 2013 the volts of what the robot names battery: there are no other letters."""
+        if description.get("kind") != "event":
+            return ()
+        if description.get("command") == "hit":
+            return (_say(self.version, "hit", 1),)
+        volts = (description.get("readings") or {}).get("battery")
+        if self.version == "2012" or description.get("unit") != "V" or isinstance(volts, str | None):
+            return ()
+        return (_say(self.version, "telemetry", round(volts * 100)),) if 0 <= volts <= _VOLTS_MOST else ()
 
     def _is_void(self, word: str, value: int) -> bool:
         """Whether a message is nothing to do: a set-point as before, or no command at all."""
