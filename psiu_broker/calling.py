@@ -18,6 +18,7 @@ from psiu_broker.frame import EVERYONE, MESH, Address, Frame
 from psiu_broker.messages import Answer, CallRequest, Command
 from psiu_broker.profiles import Description, Profile, PsiuProfile, Request
 from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, canonical, listed, typed
+from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.routing.router import SELF
 from psiu_broker.routing.table import Route
@@ -36,6 +37,9 @@ LISTENING_S: Final = 0.6
 DISCOVERY_S: Final = 30.0
 """How long a discovery may take where nobody says."""
 COMMANDS_ASKED: Final = 64
+GREETINGS_AT_ONCE: Final = 8
+GREET_EVERY_S: Final = 1.0
+"""In the long run, for one robot that wants to be greeted without end."""
 _MOMENT_S: Final = 0.001
 """An outbox reads its clock a moment after a call does."""
 
@@ -74,6 +78,8 @@ class Calling:
         self._clock = clock
         self._profiles: dict[Address, Profile] = {}
         self._searches: dict[Address, _Search] = {}
+        self._greetings = Rarely()
+        self._greeted_later: set[Address] = set()
         self._ungreeted: set[Address] = set()
         self.settling_s: Callable[[], float] = lambda: 0.0
         """How long another broker may take to say that it heard a robot, too, that was searched for."""
@@ -162,8 +168,27 @@ class Calling:
             self._ungreeted.add(route.robot)
             return
         self._ungreeted.discard(route.robot)
-        for request in robot.profile.greeting():
+        try:
+            greeting = robot.profile.greeting()
+        except Exception:  # it must not break the link on which the robot was heard
+            log.exception("greeting %s", robot.name)
+            return
+        for request in greeting:
             self._exchange.send(robot.build(request), self._clock())
+
+    def greet_again(self, route: Route) -> None:
+        """As `greet`, because of what was heard of the robot: at once, but later where that comes again and again."""
+        if self._greetings.may(route.robot, self._clock(), GREET_EVERY_S, GREETINGS_AT_ONCE):
+            self.greet(route)
+        elif route.robot not in self._greeted_later:
+            self._greeted_later.add(route.robot)
+            asyncio.get_running_loop().call_later(GREET_EVERY_S, self._greet_late, route.robot)
+
+    def _greet_late(self, robot: Address) -> None:
+        self._greeted_later.discard(robot)
+        route = self._router.find(robot)
+        if route is not None and route.way.link in self._exchange.links:
+            self.greet(route)
 
     async def mend(self, route: Route) -> None:
         """Bring the robot out of what it was cut off in, then greet it.
@@ -180,7 +205,7 @@ class Calling:
         if route is None or route.way.link in (MESH, SELF.link) or route.protocol != frame.protocol:
             return
         if self._profile(route).learn(frame):
-            self.greet(route)
+            self.greet_again(route)
 
     def describe(self, frame: Frame) -> Description | None:
         """What the profile of the robot that sent `frame`, or is to have it, reads there; None where nobody knows."""

@@ -1,5 +1,6 @@
 """The one meeting point: every frame that arrives on any link passes here and has its fate written down."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Set
 from contextlib import suppress
@@ -36,6 +37,9 @@ SEARCH_EVERY_S: Final = 10.0
 """In the long run, for one robot that others search: on slow links a search would else come round to us for ever."""
 
 BITS_A_BYTE: Final = 10
+
+log = logging.getLogger(__name__)
+
 _SEARCHES: Final = frozenset({"qualseunome", "ping"})
 
 
@@ -131,6 +135,7 @@ class Exchange:
         self.alone: Set[Address] = frozenset()
         """Robots that must hear nothing but the broker's own calls now."""
         self._searches = Rarely()
+        self._mistakes = 0
         self.resident: Resident
         self._ports: dict[str, Port] = {}
         self._route_age_s: dict[str, float] = {}
@@ -349,10 +354,9 @@ class Exchange:
             case "flood":
                 return self._flood(frame, decision.hops, way, now, patience_s)
             case "answer":
-                self.resident.answer(frame, way, now)
-                return ANSWERED
+                return self._answer(frame, way, now)
             case "translate":
-                return self.resident.translate(frame, way, now)
+                return self._translate(frame, way, now)
             case "ask":
                 return self._ask(frame, decision.hops, way, now)
             case "drop":
@@ -361,11 +365,30 @@ class Exchange:
                 return decision.verdict
 
     def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float) -> Verdict | None:
-        if way is not SELF:
+        answered: Verdict = NO_ROUTE if way is SELF else self._answer(frame, way, now)
+        return self._spread(frame, hops, way, now, patience_s) if hops else answered
+
+    # What a robot says must not break the link that brought it, nor the books, by a mistake in how it is understood.
+
+    def _answer(self, frame: Frame, way: Way, now: float) -> Verdict:
+        try:
             self.resident.answer(frame, way, now)
-        if hops:
-            return self._spread(frame, hops, way, now, patience_s)
-        return NO_ROUTE if way is SELF else ANSWERED
+        except Exception:
+            self._note_mistake(frame, way)
+            return REFUSED
+        return ANSWERED
+
+    def _translate(self, frame: Frame, way: Way, now: float) -> Verdict:
+        try:
+            return self.resident.translate(frame, way, now)
+        except Exception:
+            self._note_mistake(frame, way)
+            return REFUSED
+
+    def _note_mistake(self, frame: Frame, way: Way) -> None:
+        self._mistakes += 1
+        if self._mistakes & (self._mistakes - 1) == 0:  # the 1st, 2nd, 4th, 8th, …: a flood of them is one story
+            log.exception("%s from %s was not dealt with: %d mistakes so far", frame.subject, way, self._mistakes)
 
     def _spread(
         self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float = inf

@@ -165,7 +165,7 @@ class Resident:
             return
         if route.protocol not in _TALKING and link.configuration.options.greet:
             # When the link opened, nobody was there to be greeted.
-            self._meet(route)
+            self._meet(route, again=True)
 
     def robot_gone(self, route: Route) -> None:
         self._calling.robot_gone(route)
@@ -243,10 +243,12 @@ class Resident:
     def _say(self, frame: Frame) -> Verdict | None:
         return self._exchange.send(frame, self._clock())
 
-    def _meet(self, route: Route) -> None:
+    def _meet(self, route: Route, *, again: bool = False) -> None:
         """Greet a robot that is there again; first bring it out of what it was cut off in."""
         if route.robot in self._conversations.alone and len(self._tasks) < TASKS_KEPT:
             self._start(self._mend(route))
+        elif again:
+            self._calling.greet_again(route)
         else:
             self._calling.greet(route)
 

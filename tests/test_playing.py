@@ -26,6 +26,7 @@ from psiu_broker.frame import MESH, NOBODY, Address, Frame, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest
 from psiu_broker.playing import CALLS_KEPT, STOPS_KEPT, Program
+from psiu_broker.profiles.firmata import FirmataProfile
 from psiu_broker.profiles.mitya_persona import MityaPersona
 from psiu_broker.profiles.persona import Call, Persona, Say
 from psiu_broker.profiles.profile import Description
@@ -68,10 +69,12 @@ def words(*said: str) -> bytes:
 class Lab:
     """MNERIM is on `radio`, where there is one; programs are at the other links."""
 
-    def __init__(self, *links: LinkConfiguration) -> None:
-        robots = {"MNERIM": RobotConfiguration("MNERIM", "radio", "psiu-ascii", None, None, PsiuOptions())}
+    def __init__(self, *links: LinkConfiguration, robots: Sequence[RobotConfiguration] = ()) -> None:
+        there = {robot.name: robot for robot in robots}
+        if any(link.name == "radio" for link in links):
+            there["MNERIM"] = RobotConfiguration("MNERIM", "radio", "psiu-ascii", None, None, PsiuOptions())
         made = Configuration(
-            BrokerConfiguration(name="base"), ZenohConfiguration(), {link.name: link for link in links}, robots
+            BrokerConfiguration(name="base"), ZenohConfiguration(), {link.name: link for link in links}, there
         )
         plays = [link.name for link in links if link.options.plays]
         self.router = Router(
@@ -114,8 +117,8 @@ class Lab:
 
 
 @asynccontextmanager
-async def lab(*links: LinkConfiguration) -> AsyncIterator[Lab]:
-    made = Lab(*links)
+async def lab(*links: LinkConfiguration, robots: Sequence[RobotConfiguration] = ()) -> AsyncIterator[Lab]:
+    made = Lab(*links, robots=robots)
     yield made
     assert made.balances()
     await made.resident.close()
@@ -183,6 +186,56 @@ async def test_a_robot_of_words_is_heard_by_those_who_are_played_it() -> None:
     async with lab(radio(), phone) as made:
         made.hears("radio", words("sonar", "12"))
         assert [b"12" in wire for wire in made.far["celular"].wires] == [True]
+
+
+def board(adapter: MemoryAdapter | None = None) -> LinkConfiguration:
+    return configuration("placa", "firmata", adapter, {"role": "host"})
+
+
+BOOT = bytes.fromhex("f90205 f079020550004c004100430041 00f7")
+
+
+async def test_a_board_that_boots_without_end_is_not_greeted_as_often_and_at_last_once_more() -> None:
+    async with lab(board()) as made:
+        transport = made.far["placa"]
+        before = len(transport.written)
+        for _ in range(200):
+            made.hears("placa", BOOT)
+        greeted = len(transport.written) - before
+        assert 0 < greeted <= 40
+        await until(lambda: len(transport.written) - before > greeted)
+
+
+async def test_a_robot_that_hops_between_far_ends_is_not_greeted_at_each_hop() -> None:
+    robot = RobotConfiguration("PLACA", "placa", "firmata", None, None, FirmataProfile.Options())
+    async with lab(board(MemoryDatagrams(ends=(ONE, OTHER))), robots=[robot]) as made:
+        for _ in range(100):
+            made.hears("placa", b"\xe0\x00\x00", ONE)
+            made.hears("placa", b"\xe0\x01\x00", OTHER)
+        assert len(made.far["placa"].written) <= 40
+
+
+@pytest.mark.parametrize("method", ["learn", "describe", "greeting"])
+async def test_a_mistake_of_a_profile_neither_breaks_a_link_nor_the_books(
+    method: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def mistaken(*_: object) -> object:
+        raise RuntimeError("a mistake of its own")
+
+    monkeypatch.setattr(FirmataProfile, method, mistaken)
+    watched = configuration("celular", "amarino", None, {"role": "board"}, plays="PLACA")
+    robot = RobotConfiguration("PLACA", "placa", "firmata", None, None, FirmataProfile.Options())
+    async with lab(board(), watched, board_over_udp(), robots=[robot]) as made:
+        made.hears("celular", b"A\x13")
+        made.hears("placa", b"\xe0\x00\x00")
+        made.hears("udp", b"\xe0\x00\x00", ONE)
+        assert made.links["placa"].frames_in == 1
+        assert made.balances()
+        assert "a mistake of its own" in caplog.text
+
+
+def board_over_udp() -> LinkConfiguration:
+    return configuration("udp", "firmata", MemoryDatagrams(ends=(ONE,)), {"role": "host"})
 
 
 # One program.
