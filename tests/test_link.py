@@ -58,6 +58,7 @@ class Hub:
         self.events.append("closed")
         self._told.set()
 
+    def peer_came(self, way: Way, now: float) -> None: ...
     def peer_lost(self, way: Way, now: float) -> None:
         self.lost_peers.append(way)
 
