@@ -103,4 +103,5 @@ class Tracing:
 
 
 def _harmless(protocol: str) -> str | None:
-    return PROTOCOLS[protocol].profile.harmless
+    known = PROTOCOLS.get(protocol)
+    return None if known is None else known.profile.harmless

@@ -119,3 +119,11 @@ async def test_a_question_is_never_handed_on(world: World) -> None:
     probed = await world.tracing.probed(FAR)
     assert (probed.answered, probed.reason) == (False, "FAR has just gone to broker north")
     assert world.asked == []
+
+
+async def test_a_robot_of_a_protocol_that_only_a_newer_broker_knows_is_not_asked() -> None:
+    world = World()
+    world.exchange.router.announced((FAR,), Way(MESH, "north"), "lamp/9", world.now)
+    trace = await world.tracing.trace(MNERIM, FAR, world.probe)
+    assert (trace.answered, trace.question) == (False, "nothing")
+    assert (await world.tracing.probed(FAR)).reason == "FAR speaks lamp/9, in which nothing can be asked without harm"
