@@ -23,7 +23,7 @@ from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, NOBODY, Frame, Way
 from psiu_broker.link import Hub, Link, log
-from psiu_broker.routing.outbox import Fate, Parcel, lane
+from psiu_broker.routing.outbox import COMMAND_LANE, Fate, Parcel, lane
 from psiu_broker.routing.set_points import SetPoints
 from psiu_broker.routing.verdicts import DELIVERED, LINK_DOWN, REFUSED, SUPERSEDED, Verdict
 
@@ -147,7 +147,8 @@ class PacedLink(Link):
             return REFUSED
         hold_s = self._rests[robot].hold_s
         expires = now + min(self._max_age_s, patience_s, hold_s)
-        parcel = Parcel(payload, peer, lane(frame), expires, fate or Fate(frame, arrived))
+        # A set-point is no question, whatever its word; there is room for a stop and one other.
+        parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), expires, fate or Fate(frame, arrived))
         superseded = self.outbox.replace(parcel)
         self._ages[robot, parcel.lane] = now + hold_s
         self._empty.clear()

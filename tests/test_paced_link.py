@@ -128,6 +128,11 @@ def set_point(robot: Address, left: int, right: int, subject: str = "rodas") -> 
     return Frame(NOBODY, robot, subject, payload, "soccer")
 
 
+def asked(robot: Address) -> Frame:
+    """A set-point under a word for which other links have a lane of its own."""
+    return set_point(robot, 3, 3, "qualseunome")
+
+
 def pare(robot: Address) -> Frame:
     return set_point(robot, 0, 0, "pare")
 
@@ -168,6 +173,18 @@ class Lab:
     @property
     def packets(self) -> list[str]:
         return [wire.hex() for wire in self.transport.wires]
+
+
+# The books.
+
+
+def test_whatever_their_words_no_set_point_is_lost_without_a_trace() -> None:
+    lab = Lab().open()
+    offered = [make(robot) for robot in (ONE, TWO, THREE) for make in (pare, lambda each: set_point(each, 5, 5), asked)]
+    assert [lab.offer(frame) for frame in offered] == [None] * len(offered)
+    assert len(lab.hub.fates) + lab.link.outbox.size == len(offered)
+    lab.clock.slots(5)
+    assert (len(lab.hub.fates), lab.link.outbox.size) == (len(offered), 0)
 
 
 # The stream of packets.
