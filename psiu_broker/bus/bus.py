@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from psiu_broker.bus.access import access_control
 from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.mesh import ZenohMesh
@@ -89,6 +90,8 @@ class Bus:
             connect=[*mesh.connect, *connect],
             mode=mesh.mode,
             discover=mesh.discover,
+            tls=zenoh.tls,
+            access=access_control(zenoh, trunks=bool(configuration.trunks)),
             lost=lambda _: lost(),
         )
         try:

@@ -11,7 +11,9 @@ from pydantic import ValidationError
 from pydantic_core import from_json
 
 from psiu_broker.bus.keys import KEY_LENGTH_MAX, Keys
-from psiu_broker.bus.session import JSON, plain
+from psiu_broker.bus.session import JSON, plain, tls_links
+from psiu_broker.config import TlsConfiguration
+from psiu_broker.config.certificates import read_certificate
 from psiu_broker.errors import BusError, CallError, PsiuError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Answer, CallRequest, Card, Refusal, Status
@@ -32,14 +34,17 @@ class Client:
     Methods raise BusError where the connection or the key is at fault.
     """
 
-    def __init__(self, connect: Sequence[str], prefix: str = "psiu") -> None:
-        """Connect to one of the endpoints `connect`.
+    def __init__(self, connect: Sequence[str], prefix: str = "psiu", tls: TlsConfiguration | None = None) -> None:
+        """Connect to one of the endpoints `connect`, which begin with ``tls/`` where there are keys `tls`.
 
         Raises:
             BusError: nobody answers there within `OPEN_TIMEOUT_S`.
         """
         self.keys: Final = Keys(prefix)
-        self._session = _first_that_answers(list(connect))
+        self._tls = tls
+        self._denial: CallError | None = None
+        self._asked_rights = False
+        self._session = _first_that_answers(list(connect), tls)
 
     def __enter__(self) -> "Client":
         return self
@@ -90,6 +95,7 @@ class Client:
         wait_s = CALL_TIMEOUT_S if request.timeout_s is None else request.timeout_s + DEADLINE_MARGIN_S
         found = self._get(self._call_key(robot, command), wait_s, request.model_dump_json(exclude_none=True))
         if not found:
+            self._refuse_where_denied()
             if self.brokers():
                 raise CallError(
                     "outcome_unknown", "the broker that has the robot went away; it may have been done or not"
@@ -101,8 +107,13 @@ class Client:
             raise CallError("outcome_unknown", "the broker answered in a form that this program cannot read") from error
 
     def put_call(self, robot: Address | str, command: str, request: CallRequest | None = None) -> None:
-        """Send a command and go on; whether it arrived is not told."""
+        """Send a command and go on; whether it arrived is not told.
+
+        Raises:
+            CallError: the broker would not take it from us.
+        """
         request = request or CallRequest()
+        self._refuse_where_denied()
         try:
             self._session.put(
                 self._call_key(robot, command),
@@ -140,6 +151,21 @@ class Client:
             with suppress(zenoh.ZError):
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
+    def _refuse_where_denied(self) -> None:
+        """Raise CallError where a broker's rules let us call nobody. Of what they deny Zenoh tells nothing."""
+        if self._tls is None:
+            return
+        if not self._asked_rights:
+            name = read_certificate(self._tls.certificate).name
+            for broker, config in self.ask("config").items():
+                access = config["zenoh"].get("access")
+                if access is not None and name not in (*access["brokers"], *access["commanders"]):
+                    text = f"broker {broker} lets {name} only listen; nothing was sent"
+                    self._denial = CallError("refused", f"{text} (zenoh.access in its configuration)")
+            self._asked_rights = True
+        if self._denial is not None:
+            raise self._denial
+
     def _call_key(self, robot: Address | str, command: str) -> str:
         return _checked(self.keys.call(Address.parse(robot) if isinstance(robot, str) else robot, command))
 
@@ -170,21 +196,22 @@ class Client:
         return found
 
 
-def _first_that_answers(connect: list[str]) -> zenoh.Session:
+def _first_that_answers(connect: list[str], tls: TlsConfiguration | None) -> zenoh.Session:
     """Raises BusError."""
     for turn in range(len(connect)):
         # A Zenoh client tries the first endpoint again and again, and the others only if that connection is lost later.
         endpoints = connect[turn:] + connect[:turn]
-        config = json.dumps(_configuration(endpoints, OPEN_TIMEOUT_S / len(connect)))
+        config = json.dumps(_configuration(endpoints, OPEN_TIMEOUT_S / len(connect), tls))
         try:
             return zenoh.open(zenoh.Config.from_json5(config))
         except zenoh.ZError as error:
             if "Unable to connect" not in str(error):
                 raise BusError(f"zenoh: {plain(error)}") from error
-    raise BusError(f"no broker answers at {' or '.join(connect)}; is psiu-broker running?")
+    why = "is psiu-broker running?" if tls is None else f"is it running, and has it keys by {tls.ca}?"
+    raise BusError(f"no broker answers at {' or '.join(connect)}; {why}")
 
 
-def _configuration(endpoints: list[str], timeout_s: float) -> dict[str, object]:
+def _configuration(endpoints: list[str], timeout_s: float, tls: TlsConfiguration | None) -> dict[str, object]:
     return {
         "mode": "client",
         "connect": {
@@ -194,7 +221,10 @@ def _configuration(endpoints: list[str], timeout_s: float) -> dict[str, object]:
             "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         },
         "scouting": {"multicast": {"enabled": False}},
-        "transport": {"shared_memory": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {} if tls is None else tls_links(tls, endpoints),
+        },
     }
 
 

@@ -5,7 +5,7 @@ import atexit
 import json
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Final, Literal, Protocol, TypeVar
@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, Protocol, TypeVar
 import zenoh
 
 from psiu_broker.bus.bridge import TURN_MAX, Bridge
+from psiu_broker.config import TlsConfiguration
 from psiu_broker.errors import BusError
 
 T = TypeVar("T")
@@ -117,6 +118,8 @@ class Session:
         connect: Sequence[str] = (),
         mode: Mode = "peer",
         discover: bool = False,
+        tls: TlsConfiguration | None = None,
+        access: Mapping[str, object] | None = None,
         lost: Callable[[BusError], None] = lambda error: None,
     ) -> "Session":
         """Listen at `listen`, and connect to each of `connect`, whenever somebody is there.
@@ -124,12 +127,19 @@ class Session:
         Args:
             mode: "peer": who connects to one another talks, and nobody relays; "router": Zenoh relays.
             discover: find others on the local network by multicast.
+            tls: keys; each side shows its certificate. Then nothing but what `listen` and `connect` speak is spoken.
+            access: who may do what, as `access.access_control` makes it.
 
         Raises:
             BusError: an endpoint is taken, impossible or misspelt.
         """
         try:
-            config = zenoh.Config.from_json5(json.dumps(_configuration(listen, connect, mode, discover)))
+            written = _configuration(listen, connect, mode, discover)
+            if tls is not None:
+                written["transport"]["link"] |= tls_links(tls, [*listen, *connect])
+            if access is not None:
+                written["access_control"] = access
+            config = zenoh.Config.from_json5(json.dumps(written))
             session = await aside(zenoh.open, config)
         except Exception as error:
             raise BusError(_open_problem(error)) from error
@@ -247,7 +257,25 @@ def _is_panic(error: BaseException) -> bool:
     return type(error).__name__ == "PanicException"
 
 
-def _configuration(listen: Sequence[str], connect: Sequence[str], mode: Mode, discover: bool) -> dict[str, object]:
+def tls_links(tls: TlsConfiguration, endpoints: Iterable[str]) -> dict[str, object]:
+    """Zenoh's ``transport.link`` for one that shows its certificate at `endpoints`, and wants to see the other's."""
+    return {
+        # Zenoh would otherwise follow whoever answers its multicast to an endpoint without a certificate.
+        "protocols": sorted({"tls", *(endpoint.partition("/")[0] for endpoint in endpoints)}),
+        "tls": {
+            "root_ca_certificate": tls.ca,
+            "enable_mtls": True,
+            "listen_certificate": tls.certificate,
+            "listen_private_key": tls.key,
+            "connect_certificate": tls.certificate,
+            "connect_private_key": tls.key,
+            # Addresses change. Only the certificates of brokers are for being called at all.
+            "verify_name_on_connect": False,
+        },
+    }
+
+
+def _configuration(listen: Sequence[str], connect: Sequence[str], mode: Mode, discover: bool) -> dict[str, Any]:
     return {
         "mode": mode,
         "listen": {"endpoints": list(listen), "exit_on_failure": True},

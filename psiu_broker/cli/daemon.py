@@ -16,6 +16,7 @@ _HERE: Final = "psiu_broker.cli"
         "run": ("Be the broker.", f"{_HERE}.run:run"),
         "check": ("Say what is wrong in a configuration.", f"{_HERE}.configuration:check"),
         "schema": ("Print the JSON schema of the configuration.", f"{_HERE}.configuration:schema"),
+        "keys": ("Make keys and certificates for brokers and programs.", f"{_HERE}.keys:keys"),
         "demo": ("See a broker and simulated robots of every protocol at work.", f"{_HERE}.demo:demo"),
     },
     context_settings={"help_option_names": ["-h", "--help"]},

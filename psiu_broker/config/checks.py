@@ -237,7 +237,7 @@ def _endpoints(zenoh: ZenohConfiguration, mesh: MeshConfiguration) -> Iterator[t
 
 def check_keys(zenoh: ZenohConfiguration, problems: Problems) -> None:
     """The files of ``[zenoh.tls]`` are there, belong together, and are the broker's alone."""
-    if zenoh.tls is not None and (found := problem(zenoh.tls)) is not None:
+    if zenoh.tls is not None and (found := problem(zenoh.tls, serves=True)) is not None:
         option, text = found
         problems.add(("zenoh", "tls", option), text)
 
