@@ -472,6 +472,21 @@ def test_a_robot_s_name_is_not_an_address(problems):
             id="a robot that is not there is played",
         ),
         pytest.param(
+            CORPO.replace("corpo", "base"),
+            "links.base: who is there is known by the name of the link, which is the broker's own name;",
+            id="a robot named after its link as the broker is",
+        ),
+        pytest.param(
+            CORPO.replace("corpo", "A") + 'plays = "A"\n' + RADIO + '[robots.A]\nlink="radio"',
+            "links.A: who is there is known by the name of the link, which is the name of a robot;",
+            id="a program named after its link as a robot is",
+        ),
+        pytest.param(
+            CORPO.replace("corpo", "0x12"),
+            "links.0x12: who is there is known by the name of the link, which is a PSIU HEXA address;",
+            id="a robot named after its link like a number",
+        ),
+        pytest.param(
             RADIO + 'plays = "A"\n[robots.A]\nlink="radio"',
             "links.radio.plays: is not for psiu-ascii, whose programs name the robots themselves; remove it",
             id="a robot is played where all of them are found by name",

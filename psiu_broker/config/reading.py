@@ -26,6 +26,7 @@ from psiu_broker.config.checks import (
     check_trunk,
     warnings_about,
 )
+from psiu_broker.config.far_names import check_far_names
 from psiu_broker.config.problems import Key, Problems, got, guess, suggestion
 from psiu_broker.config.tables import (
     LINK_NAME,
@@ -116,6 +117,7 @@ def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> 
     check_devices(whole_links.values(), trunks.values(), problems)
     if None not in links.values():
         check_ends(whole_links, whole_robots, problems)
+        check_far_names(broker, whole_links.values(), whole_robots, problems)
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
     if zenoh is not None and mesh is not None:
         zenoh = _with_files(zenoh, file.parent)
