@@ -148,8 +148,10 @@ def upload(connection: Connection, robot: str, slot: int, file: BinaryIO) -> Non
     (psiu schema Answer), or a refusal (psiu schema Refusal). In a pipe, lines with the messages sent and all of them.
     """
     text, name = _text(file), _name(file)
-    if len(text.encode()) > TEXT_MAX:
-        raise Wrong(problem_lines(read(text, vocabulary("2012")).problems, name))
+    # What is wrong with the whole is so in any version; all else is for the broker to know.
+    whole = [problem for problem in read(text, vocabulary("2012")).problems if not problem.line]
+    if whole:
+        raise _wrong(connection, [problem.text for problem in whole], name)
     with connection.client() as client:
         shown = Progress(robot, quiet=connection.as_json)
         try:
@@ -311,10 +313,15 @@ def _failure(connection: Connection, error: CallError, file: str) -> Failure:
     """What became of an upload; the mistakes of the script, where it is these."""
     lines = str(error).split("\n")
     if error.code == "refused" and _LINE.fullmatch(lines[0]):
-        if connection.as_json:
-            print_json({"error": error.code, "message": str(error)})
-        return Wrong([_with_file(line, file) for line in lines])
+        return _wrong(connection, lines, file)
     return connection.failure(error.code, _with_file(str(error), file) if _LINE.fullmatch(str(error)) else str(error))
+
+
+def _wrong(connection: Connection, lines: Sequence[str], file: str) -> Failure:
+    """The mistakes of a script, which was not sent."""
+    if connection.as_json:
+        print_json({"error": "refused", "message": "\n".join(lines)})
+    return Wrong([_with_file(line, file) for line in lines])
 
 
 def _with_file(text: str, file: str) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import pty
 import re
 import signal
 import socket
@@ -95,10 +96,10 @@ link = "corpo"
         arguments = ["roboscript", *map(str, words)]
         return await asyncio.to_thread(lambda: CliRunner().invoke(psiu, arguments, env=self.env, prog_name="psiu"))
 
-    async def start(self, *words: str | Path) -> asyncio.subprocess.Process:
+    async def start(self, *words: str | Path, stderr: int = subprocess.PIPE) -> asyncio.subprocess.Process:
         """The same in a process of its own."""
         return await asyncio.create_subprocess_exec(
-            PSIU, "roboscript", *words, env={**os.environ, **self.env}, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            PSIU, "roboscript", *words, env={**os.environ, **self.env}, stdout=subprocess.PIPE, stderr=stderr
         )
 
     async def call(self, command: str, *parameters: int | str) -> Answer | None:
@@ -194,6 +195,41 @@ async def test_every_mistake_is_told_with_file_and_line_and_nothing_is_sent(tmp_
         in_json = await made.run("upload", "MITYA", "3", file, "--json")
         assert (in_json.exit_code, Refusal.model_validate_json(in_json.stdout).error) == (1, "refused")
         assert len(made.body.heard) == heard
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("# nothing\n", "it has no action; a script has 1 to 130: write a line such as drive 100"),
+        ("# long\n" * 20_000, "it has more than 30000 bytes: shorten its comments"),
+    ],
+)
+def test_a_script_that_is_wrong_as_a_whole_is_wrong_and_needs_no_robot(
+    tool: Run, tmp_path: Path, text: str, wrong: str
+) -> None:
+    file = tmp_path / "dance.txt"
+    file.write_text(text)
+    nowhere = ("--connect", "tcp/127.0.0.1:1")
+    told = tool("roboscript", "upload", "MITYA", "3", str(file), *nowhere)
+    assert (told.exit_code, told.stdout, told.stderr) == (1, "", f"{file}: {wrong}\n")
+    in_json = tool("roboscript", "upload", "MITYA", "3", str(file), "--json", *nowhere)
+    refusal = Refusal.model_validate_json(in_json.stdout)
+    assert (in_json.exit_code, refusal.error, refusal.message) == (1, "refused", wrong)
+
+
+async def test_at_a_terminal_the_progress_is_one_line_that_goes_when_it_is_done(tmp_path: Path) -> None:
+    async with lab(tmp_path) as made:
+        ours, its = pty.openpty()
+        try:
+            process = await made.start("upload", "MITYA", "3", made.file(DANCE), stderr=its)
+            out, _ = await process.communicate()
+            shown = os.read(ours, 10_000).decode()
+        finally:
+            os.close(ours)
+            os.close(its)
+        assert process.returncode == 0
+        assert re.fullmatch(rb"MITYA: slot 3 recorded \(.*\)\n", out)
+        assert shown == "".join(f"\rMITYA: {sent} of 7 messages\x1b[K" for sent in range(2, 8)) + "\r\x1b[K"
 
 
 @pytest.mark.parametrize("version", ["2012", "2013"])

@@ -40,9 +40,8 @@ def read(text: str, vocabulary: Vocabulary) -> Script:
     """Read a script file and check it: every problem is told, up to `PROBLEMS_SHOWN`. Never raises."""
     if not vocabulary.forms:
         return Script((), (Problem(0, no_roboscript(vocabulary)),))
-    size = len(text.encode("utf-8", "replace"))
-    if size > TEXT_MAX:
-        return Script((), (Problem(0, f"it has {size} bytes; {TEXT_MAX} at most: shorten its comments"),))
+    if len(text.encode("utf-8", "replace")) > TEXT_MAX:
+        return Script((), (Problem(0, f"it has more than {TEXT_MAX} bytes: shorten its comments"),))
     reader = _Reader(vocabulary)
     # Not splitlines(): an editor does not count a form feed as a line.
     lines = text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n").split("\n")

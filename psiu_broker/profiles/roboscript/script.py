@@ -8,8 +8,9 @@ At an error it says so and ``r0200``, has emptied the slot and does again what i
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
-from psiu_broker.codecs.mitya import BY_WORD, LETTER, LETTERS, Version, message
+from psiu_broker.codecs.mitya import BY_WORD, LETTER, LETTERS, STOP, Version, message
 from psiu_broker.messages import Value
+from psiu_broker.routing.outbox import is_stop
 
 SLOTS: Final = 10
 """Slots 0 to 9. The document says 0A, the firmware has ten."""
@@ -63,8 +64,10 @@ class Vocabulary:
         self._by_letter = {form.letter: name for name, form in reversed(self.forms.items()) if not form.fixed}
 
     def name(self, said: str) -> str | None:
-        """The name that `said`, a name or a letter, stands for; None where it is no action."""
-        return said if said in self.forms else self._by_letter.get(said)
+        """The name that `said`, a name, a letter or any word for a stop, stands for; None where it is no action."""
+        if said in self.forms:
+            return said
+        return STOP if is_stop(said) and STOP in self.forms else self._by_letter.get(said)
 
     def is_wait(self, said: str) -> bool:
         return said.lower() == WAIT or LETTERS[self.version].get(said) == WAIT
@@ -73,6 +76,19 @@ class Vocabulary:
         """The line of a script that stands for this message; None where it is no action."""
         name = self._by_letter.get(letter)
         return None if name is None else f"{name} {self.forms[name].shown(value)}"
+
+    def trouble(self, letter: str, value: int) -> str | None:
+        """Why `read` refuses the line of this message, which a body would record; None where it does not."""
+        name = self._by_letter.get(letter)
+        if name is None:
+            return None
+        form = self.forms[name]
+        shown = form.shown(value)
+        try:
+            form.value([shown])
+        except ValueError:
+            return f"{name} {shown} is outside of what it takes, {form.takes}"
+        return None
 
 
 class Action(NamedTuple):

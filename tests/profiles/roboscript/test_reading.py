@@ -54,6 +54,11 @@ def test_names_are_read_in_any_case_and_letters_in_theirs() -> None:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("word", ["stop", "STOP", "pare", "Pare"])
+def test_a_stop_may_be_written_as_in_a_call(word: str) -> None:
+    assert read(word, OLD).actions == (Action("D", 0, 0, 1),)
+
+
 def test_each_version_has_its_letters() -> None:
     assert read("G 5\ns\nM 0x0101\n= 0\nh 100", NEW).actions == (
         Action("G", 5, 0, 1), Action("s", 1, 0, 2), Action("M", 0x101, 0, 3), Action("=", 0, 0, 4),
@@ -166,7 +171,7 @@ def test_all_mistakes_are_told_at_once_in_their_order_and_only_so_many() -> None
 def test_a_long_text_is_refused() -> None:
     assert read("drive 1 #" + "x" * (TEXT_MAX - 9), OLD).problems == ()
     (problem,) = read("drive 1 #" + "x" * (TEXT_MAX - 8), OLD).problems
-    assert "30001 bytes" in problem.text
+    assert "more than 30000 bytes" in problem.text
 
 
 @given(st.text(), st.sampled_from(["2012", "2013", "2014"]))

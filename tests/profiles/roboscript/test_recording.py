@@ -144,6 +144,15 @@ def test_the_answer_to_a_question_of_the_greeting_is_no_objection() -> None:
     assert mitya.read(mitya.request("roboscript-upload", [3, "drive 1"]), objection) is not None
 
 
+def test_another_error_to_that_question_is_one_for_it_ends_the_recording() -> None:
+    mitya = robot()
+    request = mitya.request("roboscript-upload", [3, "drive 1"])
+    list(mitya.greeting())
+    out_of_step = said("2012", b"E0001")
+    mitya.learn(out_of_step)
+    assert mitya.read(request, out_of_step) is not None
+
+
 def test_other_commands_are_those_of_any_robot_mitya() -> None:
     mitya = robot()
     assert mitya.request("play", [3]).payload == b"r0003"
