@@ -17,6 +17,8 @@ _HEXADECIMAL: Final = re.compile(rb"[0-9A-Fa-f]+")
 def decompiled(capture: bytes, vocabulary: Vocabulary) -> tuple[str, tuple[str, ...]]:
     """The script in a captured upload, as a file that `read` reads, and what is wrong with the capture.
 
+    What `read` would refuse stays in the file, and is told.
+
     The capture is the messages themselves or their bytes in hexadecimal, with whitespace wherever it likes; what
     comes before the recording and after its end is passed over. Commands and delays alone will do as well.
     """
@@ -71,6 +73,9 @@ class _Upload:
             self.problems.append(f"message {place}: {letter}{value:04X} cannot be in a script, left out")
         else:
             self._expect_no_delay(place)
+            trouble = self._vocabulary.trouble(letter, value)
+            if trouble is not None:
+                self.problems.append(f"message {place}: {trouble}")
             self.actions.append(Action(letter, value))
             self._begun = True
 

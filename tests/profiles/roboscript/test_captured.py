@@ -117,6 +117,8 @@ def test_actions_alone_will_do() -> None:
         (b"r0103Z0001W0000D0064W01F4Z0000", "message 2: a delay without a command before it, left out"),
         (b"r0103Z0001D0064Z0000", "message 3: the command before it has no delay, which a body refuses"),
         (b"r0103Z0001E0001D0064W0000Z0000", "message 2: E0001 cannot be in a script, left out"),
+        (b"r0103Z0001D0200W0000Z0000", "message 2: drive 512 is outside of what it takes, -255 to 255"),
+        (b"r0103Z0001F0999W0000Z0000", "message 2: mood 2457 is outside of what it takes, normal (1), happy (2)"),
         (b"r0103Z0001r0000D0064W0000Z0000", "message 2: r0000 cannot be in a script, left out"),
     ],
 )
