@@ -13,6 +13,10 @@ Verdict = Literal[
     "duplicate",
     "same_way",
     "refused",
+    "denied",
+    "spoofed",
+    "too_many_names",
+    "storm",
     "link_down",
     "malformed",
 ]
@@ -35,6 +39,14 @@ SAME_WAY: Final = "same_way"
 """The destination is on the way it came from, and has heard it already."""
 REFUSED: Final = "refused"
 """The link or the protocol cannot carry it, or its source cannot be who it says."""
+DENIED: Final = "denied"
+"""A command that the policy keeps from its destination."""
+SPOOFED: Final = "spoofed"
+"""It came from elsewhere than where the configuration says that its source is."""
+TOO_MANY_NAMES: Final = "too_many_names"
+"""More names turned up on its link of late than may; its source was one too many."""
+STORM: Final = "storm"
+"""Too many frames to everyone came from its link of late."""
 LINK_DOWN: Final = "link_down"
 """The only link to the destination is down, or went down while the frame waited."""
 MALFORMED: Final = "malformed"
