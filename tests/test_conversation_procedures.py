@@ -1,13 +1,17 @@
 """Procedures, by the example of a Robot Mitya that records a script: whole, or ended before anything else is sent."""
 
 import asyncio
+import dataclasses
 
 import pytest
 from recording_body import MITYA, Body
 from scripted_robots import Robots, jumping, now, refused
 
 from psiu_broker.codecs.mitya import Version
+from psiu_broker.conversation.procedures import CUT_KEPT
+from psiu_broker.conversation.under_way import UnderWay
 from psiu_broker.errors import CallError
+from psiu_broker.frame import Address
 from psiu_broker.messages import Answer
 
 SCRIPT = """# two actions
@@ -158,6 +162,59 @@ async def test_an_ending_that_was_dropped_is_sent_again() -> None:
     body.robots.stuck = False
     await body.call("drive", 1)
     assert body.heard[4:] == [*ENDING, "D0001"]
+
+
+@jumping
+async def test_an_ending_that_is_lost_is_sent_again() -> None:
+    body = Body(Robots())
+    body.object_at = 3
+    body.deaf = {4, 5, 6, 7}
+    answer = await body.call("roboscript-upload", 3, SCRIPT)
+    assert body.heard[3:] == [*ENDING, *ENDING]
+    assert answer.remark is not None
+    assert "it records no longer" in answer.remark
+
+
+@jumping
+async def test_before_a_stop_too_a_robot_that_was_cut_off_is_brought_out_of_it() -> None:
+    body = Body(Robots())
+    task = await uploading(body, 4)
+    body.robots.refuse = CallError("link_down", "link corpo is down")
+    body.robots.conversations.link_down("corpo", "unplugged")
+    await refused(task)
+    body.robots.refuse = None
+    await body.call("stop")
+    assert body.heard[4:] == [*ENDING, "D0000"]
+    assert (body.recording, body.done) == (None, ["D0000", "D0000"])
+
+
+@jumping
+async def test_an_upload_that_had_to_wait_is_not_begun_where_it_could_not_end() -> None:
+    body = Body(Robots())
+    takes_s = 2 * 0.25 + 4 * 0.05 + 2
+    first = asyncio.ensure_future(body.call("drive", 1))
+    await asyncio.sleep(0)
+    error = await refused(body.call("roboscript-upload", 3, SCRIPT, timeout_s=takes_s + 0.1))
+    assert error.code in ("busy", "expired")
+    await first
+    assert body.heard == ["D0001"]
+    assert MITYA not in body.robots.conversations.alone
+
+
+@jumping
+async def test_no_more_robots_than_so_many_are_remembered_as_cut_off() -> None:
+    body = Body(Robots())
+    procedures = body.robots.conversations._procedures
+    body.robots.refuse = CallError("link_down", "link corpo is down")
+    request = body.profile.request("roboscript-abort", [])
+    assert request.procedure is not None
+    for number in range(CUT_KEPT + 1):
+        robot = dataclasses.replace(body.robot, address=Address.named(f"M{number}"))
+        call = UnderWay(robot, "roboscript-abort", request, now(), now() + 1, now() + 1)
+        with pytest.raises(CallError, match="may be out of reach"):
+            await procedures.perform(call, request.procedure)
+    assert len(procedures._cut) == len(procedures.alone) == CUT_KEPT
+    assert Address.named("M0") not in procedures.alone
 
 
 @pytest.mark.parametrize("number", MESSAGES)
