@@ -10,17 +10,15 @@ from typing import Any
 
 import zenoh
 from ports import free_port
+from secure_keys import files, make_keys
 
 from psiu_broker.broker import Broker
 from psiu_broker.bus.client import Client
-from psiu_broker.cli.authority import Authority
 from psiu_broker.config import TlsConfiguration, load
 from psiu_broker.simulator import AsciiRobot, UdpPort
 
 REMOTE = zenoh.Locality.REMOTE
 FORGED = b"forged"
-BROKERS = ("base", "hill", "valley", "spy")
-PROGRAMS = ("operator", "screen", "stranger")
 
 CONFIGURATION = """
 [broker]
@@ -47,17 +45,6 @@ peers = ["127.0.0.1:{robot}"]
 protocol = "psiu-ascii"
 timeout_s = 0.5
 """
-
-
-def make_keys(folder: Path, brokers: Sequence[str] = BROKERS, programs: Sequence[str] = PROGRAMS) -> Path:
-    authority = Authority(folder)
-    for name in (*brokers, *programs):
-        authority.make(name, 30, broker=name in brokers)
-    return folder
-
-
-def files(keys: Path, name: str) -> TlsConfiguration:
-    return TlsConfiguration(ca=f"{keys}/ca.pem", certificate=f"{keys}/{name}.pem", key=f"{keys}/{name}.key")
 
 
 def zenoh_config(endpoint: str, tls: TlsConfiguration | None, *, listen: bool = False, mode: str = "client") -> Any:

@@ -283,7 +283,7 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         ("[links]\nradio = 3", "links.radio: expected a table, got 3; write [links.radio] above its keys"),
         (
             '[zenoh]\nlisten = ["10.0.0.1:7447"]',
-            "zenoh.listen[0]: expected tcp/HOST:PORT (or udp/, ws/, unixsock-stream/PATH),"
+            "zenoh.listen[0]: expected tcp/HOST:PORT (or tls/, udp/, ws/, unixsock-stream/PATH),"
             ' got "10.0.0.1:7447"; write it like tcp/127.0.0.1:7447',
         ),
         ('[zenoh]\nlisten = ["serial/dev/ttyUSB0:1"]', "zenoh.listen[0]: expected tcp/HOST:PORT"),
@@ -710,11 +710,11 @@ def test_an_adapter_that_cannot_be_loaded_is_told_in_one_line(problems, monkeypa
     ("text", "expected"),
     [
         (
-            '[zenoh]\nlisten = ["tcp/127.0.0.1:1", "tcp/0.0.0.0:7447"]',
+            '[zenoh]\nunprotected = true\nlisten = ["tcp/127.0.0.1:1", "tcp/0.0.0.0:7447"]',
             "radio.toml: zenoh.listen[1]: tcp/0.0.0.0:7447 lets",
         ),
-        ('[zenoh]\nlisten = ["tcp/[::]:7447"]', "radio.toml: zenoh.listen[0]: "),
-        ('[zenoh]\nlisten = ["tcp/robot.lan:7447"]', "radio.toml: zenoh.listen[0]: "),
+        ('[zenoh]\nunprotected = true\nlisten = ["tcp/[::]:7447"]', "radio.toml: zenoh.listen[0]: "),
+        ('[zenoh]\nunprotected = true\nlisten = ["tcp/robot.lan:7447"]', "radio.toml: zenoh.listen[0]: "),
         (
             RADIO.replace("/dev/serial/by-id/radio", "/dev/ttyUSB0"),
             "radio.toml: links.radio.device: /dev/ttyUSB0 may be",

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import zenoh
 from ports import free_port
-from secure_lab import FORGED, REMOTE, SecureLab, Spy, files, make_keys, program, until, zenoh_config
+from secure_keys import files, make_keys
+from secure_lab import FORGED, REMOTE, SecureLab, Spy, program, until, zenoh_config
 
 from psiu_broker.broker import Broker
 from psiu_broker.bus.access import EVERYTHING, access_control

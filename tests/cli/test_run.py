@@ -189,7 +189,8 @@ def test_a_good_configuration_is_counted_and_its_warnings_told(daemon: Run, tmp_
     good = daemon("check", str(EXAMPLE))
     assert (good.exit_code, good.stdout, good.stderr) == (0, f"{EXAMPLE}: good: 3 links, 1 robot\n", "")
     file = tmp_path / "open.toml"
-    file.write_text(EXAMPLE.read_text().replace("127.0.0.1:7447", "0.0.0.0:7447"))
+    text = EXAMPLE.read_text().replace("127.0.0.1:7447", "0.0.0.0:7447")
+    file.write_text(text.replace("[zenoh]", "[zenoh]\nunprotected = true"))
     risky = daemon("check", str(file))
     assert risky.exit_code == 0
     assert risky.stderr.startswith("warning: ")

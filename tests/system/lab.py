@@ -32,6 +32,7 @@ CONFIGURATION: Final = """
 name = "{broker}"
 [zenoh]
 listen = ["tcp/0.0.0.0:7447"]
+unprotected = true
 [mesh]
 mode = "{mode}"
 connect = {connect}
