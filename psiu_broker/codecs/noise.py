@@ -24,12 +24,12 @@ class Noise:
 
     def add(self, data: bytes | bytearray, events: list[Event]) -> None:
         """Lengthen the run by `data`; append a `Malformed` to `events` each time it grows too long."""
-        while self.size + len(data) > LONGEST_RUN:
-            room = LONGEST_RUN - self.size
-            self._keep(data[:room])
+        at = 0
+        while (room := LONGEST_RUN - self.size) < len(data) - at:
+            self._keep(data, at, room)
             self.end(NOISE, events)
-            data = data[room:]
-        self._keep(data)
+            at += room
+        self._keep(data, at, len(data) - at)
 
     def end(self, reason: str, events: list[Event]) -> None:
         """The run is over: append it to `events`, if there was one."""
@@ -38,6 +38,6 @@ class Noise:
             self.kept.clear()
             self.size = 0
 
-    def _keep(self, data: bytes | bytearray) -> None:
-        self.kept += data[: _KEPT - len(self.kept)]
-        self.size += len(data)
+    def _keep(self, data: bytes | bytearray, at: int, size: int) -> None:
+        self.kept += data[at : at + min(size, _KEPT - len(self.kept))]
+        self.size += size

@@ -1,5 +1,7 @@
 from itertools import pairwise
+from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,3 +41,25 @@ def test_endless_noise_is_reported_in_pieces_wherever_it_is_cut(cuts: list[int])
     noise.end("noise", events)
     assert [event.size for event in events if isinstance(event, Malformed)] == [4096, 4096, 10000 - 8192]
     assert [event.wire for event in events] == [data[at : at + MALFORMED_KEPT] for at in (0, 4096, 8192)]
+
+
+class _Counted(bytes):
+    """Bytes that count how many of them are copied when they are cut."""
+
+    copied = 0
+
+    def __getitem__(self, place: Any) -> Any:
+        cut = super().__getitem__(place)
+        if isinstance(cut, bytes):
+            type(self).copied += len(cut)
+            return _Counted(cut)
+        return cut
+
+
+def test_noise_of_any_length_is_copied_once_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Counted, "copied", 0)
+    data = _Counted(100 * LONGEST_RUN)
+    events: list[Event] = []
+    Noise().add(data, events)
+    assert len(events) == 99
+    assert _Counted.copied <= len(data)
