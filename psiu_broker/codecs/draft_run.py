@@ -50,12 +50,11 @@ class DraftRun(Run):
 
     def size_field(self, text: bytes | bytearray, edge: int = 0, begin: int = 1) -> re.Match[bytes] | None:
         """The first three digits, from `begin` on, behind a known name that begins at `edge` or later."""
-        lengths: set[int] = set()
+        names = self._directory.all_names
         for size in _SIZE.finditer(text, begin):
-            lengths = lengths or {len(EVERYONE.name), *map(len, self._directory.all_names)}
             end = size.start()
-            names = (text[end - each : end] for each in lengths if 0 < each <= end - edge)
-            if any(self._is_known(name.decode("ascii", "replace")) for name in names):
+            before = text[max(edge, end - LONGEST_NAME) : end].decode("ascii", "replace")
+            if before.endswith(EVERYONE.name) or any(before[at:] in names for at in range(len(before))):
                 return size
         return None
 

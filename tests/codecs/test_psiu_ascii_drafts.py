@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -365,3 +365,31 @@ def test_a_byte_of_a_long_input_costs_no_more_than_one_of_a_short_input(chosen: 
         return min(costs)
 
     assert cost_s(64_000, 1) < 16 * cost_s(2_000, 10)
+
+
+class _Counted(set[str]):
+    """Names that count how often each of them is looked at."""
+
+    looked_at = 0
+
+    def __iter__(self) -> Iterator[str]:
+        for name in super().__iter__():
+            self.looked_at += 1
+            yield name
+
+    def __contains__(self, name: object) -> bool:
+        self.looked_at += 1
+        return super().__contains__(name)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_digits_cost_no_more_among_thousands_of_robots_whatever_their_names(version: str) -> None:
+    def looks(many: int) -> int:
+        names = _Counted("N" * length for length in range(1, many + 1))
+        codec = PsiuAscii(PsiuAscii.Options(version=version), Directory(all_names=names))
+        for _ in range(200):
+            codec.decode(b"7", 0.0)
+        codec.flush(0.0)
+        return names.looked_at
+
+    assert looks(900) <= looks(LONGEST_NAME)
