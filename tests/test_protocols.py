@@ -184,7 +184,8 @@ link = "radio"
             program.send(b"Q0001")
             complaint = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(program, 100), 2.0)
             assert complaint == b"E0102"
-        assert made.broker.ledger().total.arrived > 0
+        account = next(each for each in made.broker.ledger().accounts if each.link == "painel")
+        assert (account.arrived, account.answered) == (4, 4)
 
 
 async def test_robots_of_a_team_are_told_their_wheels_in_packets_that_all_of_them_hear(tmp_path: Path) -> None:
@@ -286,14 +287,39 @@ async def test_a_robot_of_the_second_draft_is_called(tmp_path: Path) -> None:
 
 
 async def test_a_trace_never_moves_a_robot_that_cannot_be_asked(tmp_path: Path) -> None:
-    body = MityaBody("MITYA", version="2013")
-    port = PtyPort(body, link=tmp_path / "corpo")
+    heard: list[bytes] = []
+    port = PtyPort(
+        MityaBody("MITYA", version="2013"),
+        link=tmp_path / "corpo",
+        observer=lambda way, data: heard.append(data) if way == "in" else None,
+    )
     text = link("corpo", port.path, "mitya", 'version = "2013"') + '[robots.MITYA]\nlink = "corpo"\n'
     async with lab(tmp_path, text, port) as made:
         trace = await made.broker.trace(Address.parse("base"), Address.parse("MITYA"))
         assert trace is not None
         assert (trace.answered, trace.question) == (False, "nothing")
         assert trace.reason == "MITYA speaks mitya, in which nothing can be asked without harm"
+        await made.call("MITYA", "headlights", 1)
+        assert b"".join(heard) == b"I0001", "what is heard is what was called, and nothing before it"
+
+
+async def test_a_program_in_words_hears_nothing_of_a_mitya_that_does_not_answer_but_its_errors(tmp_path: Path) -> None:
+    body, pc = MityaBody("MITYA", version="2012"), AsciiRobot("PC")
+    said: list[bytes] = []
+    corpo = PtyPort(body, link=tmp_path / "corpo")
+    radio = PtyPort(pc, link=tmp_path / "radio", observer=lambda way, data: said.append(data) if way == "in" else None)
+    text = (
+        link("corpo", corpo.path, "mitya", 'version = "2012"')
+        + link("radio", radio.path, "psiu-ascii", "greet = false")
+        + '[robots.MITYA]\nlink = "corpo"\nerror_ms = 50\n'
+    )
+    async with lab(tmp_path, text, corpo, radio) as made:
+        radio.send(message("MITYA", "drive 100", "PC"))
+        await until(lambda: body.body.left == 100)
+        radio.send(message("MITYA", "drive 99999", "PC"))
+        await until(lambda: any(b"drive falha MITYA" in each for each in said))
+        await made.call("MITYA", "drive", 0)  # one after another: the first is over
+        assert [each.split()[2:-1] for each in said] == [[b"drive", b"falha", b"MITYA"]]
 
 
 async def test_a_program_in_words_at_one_broker_moves_a_mitya_at_another(tmp_path: Path) -> None:
