@@ -59,6 +59,10 @@ class Transport(ABC):
     async def close(self) -> None:
         """Release everything; harmless twice."""
 
+    def is_named(self, peer: Peer) -> bool:
+        """Whether `peer` is this computer, or the adapter's options name it; asked only where it is `exposed`."""
+        return False
+
     def status(self) -> Mapping[str, str | int | float]:
         """Facts for `psiu links`: the device behind a by-id name, datagrams lost, …"""
         return {}
@@ -99,6 +103,14 @@ class Adapter(BaseModel, ABC):
             ValueError: nobody; the text says what to write instead. Default: always.
         """
         raise ValueError("is for links with several far ends, and this one has a single one; remove it")
+
+    @property
+    def exposed(self) -> bool:
+        """Whether other computers can reach the link without anybody's leave; default: no.
+
+        Whoever comes from there, and is not `Transport.is_named`, may not command robots unless the policy says so.
+        """
+        return False
 
     @property
     def reliable_stream(self) -> bool:

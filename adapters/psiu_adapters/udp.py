@@ -19,6 +19,7 @@ from psiu_adapters.udp_sockets import (
     bound,
     has_route,
     is_broadcast,
+    is_loopback,
     is_multicast,
     is_own,
     joined,
@@ -115,6 +116,11 @@ class Udp(Adapter):
     def many_peers(self) -> bool:
         numbers = map(numeric, self.peers)
         return self.learn or len(self.peers) > 1 or any(found and is_multicast(found[1]) for found in numbers)
+
+    @property
+    def exposed(self) -> bool:
+        """Where whoever sends is learned, unless nothing beyond this computer can send there."""
+        return self.learn and not is_loopback(split(self.listen)[0])
 
     def peer_named(self, text: str) -> Peer:
         try:
@@ -218,6 +224,10 @@ class _UdpTransport(Transport):
     def peers(self) -> Collection[Peer]:
         """Fixed and learned; the fixed alone where a group is among them, or its members would hear all twice."""
         return self._everyone
+
+    def is_named(self, peer: Peer) -> bool:
+        entry = self._by_peer.get(peer)
+        return entry is not None and (entry.fixed or is_loopback(entry.address[0]))
 
     def write(self, data: bytes, peer: Peer) -> bool:
         entry = self._by_peer.get(peer)

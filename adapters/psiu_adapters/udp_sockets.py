@@ -145,6 +145,14 @@ def joined(main: socket.socket, group: Address, interface: str) -> socket.socket
     return extra
 
 
+def is_loopback(host: str) -> bool:
+    """Whether nothing but this computer sends from, or to, `host`; of a name only localhost is known."""
+    try:
+        return ipaddress.ip_address(host.partition("%")[0]).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def is_multicast(address: Address) -> bool:
     return ipaddress.ip_address(address[0].partition("%")[0]).is_multicast
 
