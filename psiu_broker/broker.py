@@ -79,8 +79,11 @@ class Broker:
         self.started = time.time()
         name = configuration.broker.name
         self._directories = Directories()
-        slowest_s = max((link.options.max_age_s for link in configuration.links.values()), default=0.0)
-        duplicates = Duplicates(slowest_s + DOUBLES_MARGIN_S)
+        options = [link.options for link in configuration.links.values()]
+        duplicates = Duplicates(
+            max((each.max_age_s for each in options), default=0.0) + DOUBLES_MARGIN_S,
+            question_s=max((each.question_max_age_s for each in options), default=0.0) + DOUBLES_MARGIN_S,
+        )
         neighbours = Neighbours()
         self._ownership = Ownership(name, neighbours.alive, duplicates.heard_here, self._heard_of_another)
         router = Router(

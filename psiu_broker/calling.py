@@ -100,7 +100,7 @@ class Calling:
         timeout_s = request.timeout_s
         if timeout_s is not None:
             timeout_s -= asyncio.get_running_loop().time() - begun
-        fresh_s = inf if asked_at is None else self._fresh_s(route, asked_at)
+        fresh_s = inf if asked_at is None else self._fresh_s(route, command, asked_at)
         return await self.ask(route, command, request.parameters, timeout_s, fresh_s)
 
     async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
@@ -117,7 +117,7 @@ class Calling:
             return
         if route.way.link == MESH:
             raise _elsewhere(route)
-        fresh_s = self._fresh_s(route, asked_at)
+        fresh_s = self._fresh_s(route, command, asked_at)
         if request.timeout_s is not None:
             fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
         await self.conversations.tell(self._robot(route), command, request.parameters, fresh_s=fresh_s)
@@ -246,10 +246,10 @@ class Calling:
 
     # Inside.
 
-    def _fresh_s(self, route: Route, asked_at: float) -> float:
-        """How long what was asked for then may still wait before it is too late for the robot."""
+    def _fresh_s(self, route: Route, command: str, asked_at: float) -> float:
+        """How long `command`, asked for then, may still wait before it is too late for the robot."""
         link = self._exchange.links.get(route.way.link)
-        return inf if link is None else link.configuration.options.max_age_s - (self._clock() - asked_at)
+        return inf if link is None else link.configuration.options.longest_wait_s(command) - (self._clock() - asked_at)
 
     def _dropped(self, robot: Address, verdict: Verdict) -> CallError:
         code, text = _DROPPED.get(verdict, ("refused", verdict))

@@ -18,7 +18,7 @@ from psiu_broker.messages import RawFrame
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.routing.allowance import Allowance
 from psiu_broker.routing.holding import Holding
-from psiu_broker.routing.outbox import Fate
+from psiu_broker.routing.outbox import Fate, is_question
 from psiu_broker.routing.router import ANY, DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
 from psiu_broker.routing.verdicts import (
     ANSWERED,
@@ -139,7 +139,8 @@ class Exchange:
         self.resident: Resident
         self._ports: dict[str, Port] = {}
         self._route_age_s: dict[str, float] = {}
-        self._max_age_s: dict[str, float] = {}
+        self._max_age_s: dict[str, tuple[float, float]] = {}
+        """Of what moves robots, and of questions."""
         self._own_name = own_name
         self._wall_clock = wall_clock
 
@@ -153,14 +154,14 @@ class Exchange:
             link.name, link.configuration.protocol, link.ways, options.wildcard, _domain(link.configuration.codec)
         )
         self._route_age_s[link.name] = options.route_age_s
-        self._max_age_s[link.name] = options.max_age_s
+        self._max_age_s[link.name] = options.max_age_s, options.question_max_age_s
 
     def join(self, mesh: Outlet, max_age_s: float) -> None:
         """Take in the other brokers, as far ends of the link `MESH`."""
         self._outlets[MESH] = mesh
         self.accounts[MESH] = Account()
         self._route_age_s[MESH] = inf
-        self._max_age_s[MESH] = max_age_s
+        self._max_age_s[MESH] = max_age_s, max_age_s
         self.router.link_up(Port(MESH, ANY, mesh.ways))
 
     def heard(self, frame: Frame, way: Way, now: float, patience_s: float = inf) -> Verdict | None:
@@ -198,7 +199,7 @@ class Exchange:
         decision = self.router.route(frame, way, now)
         if self.bus.listened and decision is not DOUBLE and self.router.is_here(frame.source):
             self._publish(frame, decision.hops, way)
-        patience_s = min((self._max_age_s[hop.link] for hop in decision.hops), default=inf) - age_s
+        patience_s = self._longest_wait_s(frame, decision.hops) - age_s
         verdict: Verdict | None
         if patience_s <= 0:
             verdict = EXPIRED
@@ -297,7 +298,7 @@ class Exchange:
         """`robot` has been heard: move the frames that waited for it."""
         for held in self.holding.release(robot):
             decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
-            patience_s = min((self._max_age_s[hop.link] for hop in decision.hops), default=inf) - (now - held.since)
+            patience_s = self._longest_wait_s(held.frame, decision.hops) - (now - held.since)
             verdict: Verdict | None
             if decision.action == "ask":
                 verdict = NO_ROUTE
@@ -363,6 +364,11 @@ class Exchange:
                 if decision.verdict is SAME_WAY and frame.subject in _SEARCHES:
                     return self._look_elsewhere(frame, way, now)
                 return decision.verdict
+
+    def _longest_wait_s(self, frame: Frame, hops: tuple[Way, ...]) -> float:
+        """How old `frame` may be when it leaves by any of `hops`."""
+        question = is_question(frame.subject)
+        return min((self._max_age_s[hop.link][question] for hop in hops), default=inf)
 
     def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float) -> Verdict | None:
         answered: Verdict = NO_ROUTE if way is SELF else self._answer(frame, way, now)

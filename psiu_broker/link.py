@@ -2,25 +2,32 @@
 
 A link is an adapter, a codec and an outbox, kept alive by `Link.run`. Between `received` and
 `offer` nothing waits; only `run` does.
+
+What leaves goes at once, or waits in the outbox for room in the transport or for a limit to let it go. A stop waits for
+no limit and behind nothing but another stop; yet a frame that the transport has taken cannot be called back, and
+`Transport.write` takes at most one ahead of the wire.
 """
 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from fnmatch import fnmatchcase
 from math import inf
 from typing import ClassVar, Final, Protocol
 
 from psiu_broker.adapter import Peer, Transport
 from psiu_broker.codecs.avr import avr_trouble
 from psiu_broker.codecs.codec import Codec, Event
-from psiu_broker.config import LinkConfiguration
+from psiu_broker.config import LinkConfiguration, LinkOptions
 from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import NOBODY, Address, Frame, Malformed, Way
 from psiu_broker.kept import FIRST_PAUSE_S, Kept
 from psiu_broker.routing.askers import Askers
-from psiu_broker.routing.outbox import STOP_LANE, Fate, Outbox, Parcel, lane
+from psiu_broker.routing.delays import Delays
+from psiu_broker.routing.limits import Gate, Limits, Rate
+from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE, Fate, Outbox, Parcel, is_answer, lane
 from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, SUPERSEDED, Verdict
 
 WARNED_KEPT: Final = 256
@@ -47,6 +54,13 @@ class Hub(Protocol):
     def closed(self, link: "Link", now: float) -> None: ...
     def peer_came(self, way: Way, now: float) -> None: ...
     def peer_lost(self, way: Way, now: float) -> None: ...
+
+
+class Timer(Protocol):
+    def cancel(self) -> None: ...
+
+
+CallAt = Callable[[float, Callable[[], None]], Timer]
 
 
 class _End:
@@ -76,10 +90,12 @@ class Link(Kept):
         unaddressed: bool = False,
         ends: Ends | None = None,
         clock: Callable[[], float] = time.monotonic,
+        call_at: CallAt | None = None,
     ) -> None:
         """Make the link, closed.
 
         `unaddressed`: answers do not say for whom they are; `ends`: who is there, where packets do not say it.
+        `call_at` sets a timer by `clock`; default: the event loop's, whose clock that has to be.
         """
         super().__init__(configuration.name, configuration.adapter, clock)
         self.configuration = configuration
@@ -88,15 +104,24 @@ class Link(Kept):
         self.frames_in = self.frames_out = self.malformed = self.opened = 0
         self.last_heard: float | None = None
         self.last_sent = -inf
-        self.outbox = Outbox(configuration.options.queue_frames)
+        options = configuration.options
+        self.outbox = Outbox(options.queue_frames)
+        self.delays = Delays()
+        """How long what left had waited; by `frames_out`."""
         self._ends_named = None if self.codec.addressed else ends
         self._askers = Askers() if unaddressed or self._ends_named is not None else None
         self._make_codec = codec
         self._in_pieces = configuration.adapter.datagrams and type(self.codec).pieces is not Codec.pieces
         self._hub = hub
         self._warned: set[Address] = set()
-        self._avr_limits = configuration.options.avr_limits
-        self._max_age_s = configuration.options.max_age_s
+        self._avr_limits = options.avr_limits
+        self._max_age_s = options.max_age_s
+        self._question_max_age_s = options.question_max_age_s
+        self._limits = _limits(options)
+        self._newest_wins = tuple(pattern.lower() for pattern in options.newest_wins)
+        self._call_at = call_at
+        self._opening: tuple[float, Timer] | None = None
+        """When a limit lets the first of what it holds back go."""
         self._ends: dict[Peer, _End] = {}
         self._empty: asyncio.Event = asyncio.Event()
 
@@ -129,17 +154,20 @@ class Link(Kept):
     def writable(self) -> None:
         now = self._clock()
         self.expire(now)
+        gate = None if self._limits is None else Gate(self._limits, now)
+        held = None if gate is None else gate.holds
         full: set[Peer] = set()
-        while self._transport is not None and (parcel := self.outbox.take(full)) is not None:
+        while self._transport is not None and (parcel := self.outbox.take(full, held)) is not None:
             write = self._write_pieces if self._in_pieces else self._transport.write
             if write(parcel.wire, parcel.peer):
-                self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
+                self._left(parcel, now)
                 self._hub.settled(parcel.fate, DELIVERED, now)
             elif self._transport is not None:
                 self.outbox.put_back(parcel)
                 full.add(parcel.peer)
             else:
                 self._hub.settled(parcel.fate, LINK_DOWN, now)
+        self._wait_for(gate)
         self._note_empty()
 
     def peer_lost(self, peer: Peer) -> None:
@@ -168,6 +196,7 @@ class Link(Kept):
         """Send `frame` to `peer`, or queue it for at most `patience_s` and the link's own age limit.
 
         Never waits. Returns the verdict; None if the frame is queued, and then `Hub.settled` will be told.
+        A stop, and a set-point of which the newest wins, take the place of what waits: that is `superseded`.
         """
         transport = self._transport
         if transport is None:
@@ -184,22 +213,21 @@ class Link(Kept):
             self._warn_of_avr(frame, wire)
         # Called at once where nothing is in pieces: nearly all that leaves goes this way.
         write = self._write_pieces if self._in_pieces else transport.write
-        if not (self.outbox.size and self.outbox.waits_for(peer)) and write(wire, peer):
-            self._sent(frame, wire, peer, now)
-            return DELIVERED
+        if not (self.outbox.size or self._limits):
+            if write(wire, peer):
+                self._sent(frame, wire, peer, now)
+                return DELIVERED
+            parcel = self._parcel(frame, wire, peer, now, patience_s, fate or Fate(frame, arrived))
+        else:
+            parcel = self._parcel(frame, wire, peer, now, patience_s, fate or Fate(frame, arrived))
+            if parcel.lane == STOP_LANE:
+                self._supersede(self.outbox.overtaken(parcel), now)
+            if self._is_next(parcel, now) and write(wire, peer):
+                self._left(parcel, now)
+                return DELIVERED
         if self._transport is None:
             return LINK_DOWN
-        parcel = Parcel(wire, peer, lane(frame), now + min(self._max_age_s, patience_s), fate or Fate(frame, arrived))
-        if parcel.lane == STOP_LANE:
-            for older in self.outbox.overtaken(parcel):
-                self._hub.settled(older.fate, SUPERSEDED, now)
-        evicted = self.outbox.put(parcel)
-        self._empty.clear()
-        if evicted is parcel:
-            return QUEUE_FULL
-        if evicted is not None:
-            self._hub.settled(evicted.fate, QUEUE_FULL, now)
-        return None
+        return self._queue(parcel, now)
 
     def ways(self) -> tuple[Way, ...]:
         """Every far end there is now."""
@@ -223,6 +251,68 @@ class Link(Kept):
             await self._empty.wait()
 
     # Inside.
+
+    def _parcel(self, frame: Frame, wire: bytes, peer: Peer, now: float, patience_s: float, fate: Fate) -> Parcel:
+        urgency = lane(frame)
+        longest_s = self._question_max_age_s if urgency == QUESTION_LANE else self._max_age_s
+        limit = None if self._limits is None else self._limits.of(frame.subject)
+        key: Hashable = None
+        if self._newest_wins and urgency == COMMAND_LANE and not is_answer(frame):
+            word = frame.subject.lower()
+            if any(fnmatchcase(word, pattern) for pattern in self._newest_wins):
+                key = peer, frame.destination, word
+        return Parcel(wire, peer, urgency, now, now + min(longest_s, patience_s), fate, limit, key)
+
+    def _is_next(self, parcel: Parcel, now: float) -> bool:
+        """Whether `parcel` need not wait behind any other, nor for a limit; if for a limit, it will be looked at."""
+        if self._limits is None:
+            return not self.outbox.waits_for(parcel.peer, parcel.lane)
+        gate = Gate(self._limits, now)
+        for older in self.outbox.before(parcel.lane):
+            if not gate.holds(older) and older.peer == parcel.peer:
+                return False  # for which there is no room: `writable` will be told
+        held = gate.holds(parcel)
+        self._wait_for(gate)
+        return not held
+
+    def _wait_for(self, gate: Gate | None) -> None:
+        """Look again when `gate` opens, and not before."""
+        if gate is None or gate.opens == inf or self._transport is None:
+            return
+        if self._opening is not None:
+            if self._opening[0] <= gate.opens:
+                return
+            self._opening[1].cancel()
+        call_at = self._call_at or asyncio.get_running_loop().call_at
+        self._opening = gate.opens, call_at(gate.opens, self._gate_opens)
+
+    def _gate_opens(self) -> None:
+        self._opening = None
+        self.writable()
+
+    def _queue(self, parcel: Parcel, now: float) -> Verdict | None:
+        if parcel.key is not None and (older := self.outbox.swap(parcel)) is not None:
+            self._supersede((older,), now)
+            return None
+        evicted = self.outbox.put(parcel)
+        self._empty.clear()
+        if evicted is parcel:
+            return QUEUE_FULL
+        if evicted is not None:
+            self._hub.settled(evicted.fate, QUEUE_FULL, now)
+        return None
+
+    def _supersede(self, parcels: Sequence[Parcel], now: float) -> None:
+        for parcel in parcels:
+            self._hub.settled(parcel.fate, SUPERSEDED, now)
+
+    def _left(self, parcel: Parcel, now: float) -> None:
+        """As `_sent`, of what may have waited."""
+        self._sent(parcel.fate.frame, parcel.wire, parcel.peer, now)
+        if self._limits is not None:
+            self._limits.spend(parcel, now)
+        if now > parcel.since:
+            self.delays.note(self.frames_out, now - parcel.since)
 
     def _sent(self, frame: Frame, wire: bytes, peer: Peer, now: float) -> None:
         self.frames_out += 1
@@ -314,7 +404,16 @@ class Link(Kept):
         self._ends = {}
         if self.adapter.datagrams:
             self.codec = self._make_codec()
+        if self._opening is not None:
+            self._opening[1].cancel()
+            self._opening = None
         for parcel in self.outbox.clear():
             self._hub.settled(parcel.fate, LINK_DOWN, now)
         self._empty.set()
         self._hub.closed(self, now)
+
+
+def _limits(options: LinkOptions) -> Limits | None:
+    whole = Rate(options.max_frames_s, options.max_bytes_s)
+    subjects = {subject: Rate(limit.frames_s, limit.bytes_s) for subject, limit in options.limits.items()}
+    return Limits(whole, subjects) if whole != Rate() or subjects else None

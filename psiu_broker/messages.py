@@ -144,6 +144,10 @@ class Link(Message):
     frames_out: int = 0
     malformed: int = 0
     queued: int = 0
+    delay_p50_ms: float | None = Field(
+        default=None, description="how long the last 1000 frames sent had waited to leave; null: none was sent yet"
+    )
+    delay_p99_ms: float | None = None
     reopened: int = 0
     unasked: int = Field(
         default=0, description="questions of the broker's own not asked here, to leave the line to others"

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from math import inf
-from typing import Final, Protocol
+from typing import Final
 
 from psiu_broker.adapter import Peer, Transport
 from psiu_broker.codecs.paced import PacedCodec, Rest
@@ -22,7 +22,7 @@ from psiu_broker.config import LinkConfiguration
 from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, NOBODY, Frame, Way
-from psiu_broker.link import Hub, Link, log
+from psiu_broker.link import CallAt, Hub, Link, Timer, log
 from psiu_broker.routing.outbox import COMMAND_LANE, Fate, Parcel, lane
 from psiu_broker.routing.set_points import SetPoints
 from psiu_broker.routing.verdicts import DELIVERED, LINK_DOWN, REFUSED, SUPERSEDED, Verdict
@@ -75,13 +75,6 @@ class Pace:
         return ordered[len(ordered) // 2], ordered[min(len(ordered) - 1, len(ordered) * 99 // 100)]
 
 
-class Timer(Protocol):
-    def cancel(self) -> None: ...
-
-
-CallAt = Callable[[float, Callable[[], None]], Timer]
-
-
 class PacedLink(Link):
     """A link whose codec is `paced`."""
 
@@ -100,13 +93,12 @@ class PacedLink(Link):
     ) -> None:
         """Make the link, closed.
 
-        `rests` are those of the robots, by number, for which the codec's own is not right. `call_at` sets a timer
-        by `clock`; default: the event loop's, whose clock that has to be.
+        `rests` are those of the robots, by number, for which the codec's own is not right.
 
         Raises:
             EncodeError: a rest does not fit the packets.
         """
-        super().__init__(configuration, codec, hub, ends=ends, clock=clock)
+        super().__init__(configuration, codec, hub, ends=ends, clock=clock, call_at=call_at)
         self._packets = codec()
         self._rests = dict.fromkeys(range(1, self._packets.robots + 1), self._packets.rest) | dict(rests or {})
         self.outbox = SetPoints(self._packets.robots)
@@ -119,7 +111,6 @@ class PacedLink(Link):
         """Until when what waits for a robot in a lane will hold once it is sent."""
         self._held: dict[int, tuple[bytes, float]] = {}
         """What each robot was told last, and until when it holds."""
-        self._call_at = call_at
         self._timer: Timer | None = None
         self._stops = self._packets.packet([self._rests[robot].stop for robot in sorted(self._rests)])
 
@@ -148,7 +139,7 @@ class PacedLink(Link):
         hold_s = self._rests[robot].hold_s
         expires = now + min(self._max_age_s, patience_s, hold_s)
         # A set-point is no question, whatever its word; there is room for a stop and one other.
-        parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), expires, fate or Fate(frame, arrived))
+        parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), now, expires, fate or Fate(frame, arrived))
         superseded = self.outbox.replace(parcel)
         self._ages[robot, parcel.lane] = now + hold_s
         self._empty.clear()
@@ -206,6 +197,7 @@ class PacedLink(Link):
         for robot, parcel in due.items():
             self._held[robot] = parcel.wire, self._ages[robot, parcel.lane]
             self._sent(parcel.fate.frame, wire, parcel.peer if parcel.peer in took else took[0], now)
+            self.delays.note(self.frames_out, now - parcel.since)
             self._hub.settled(parcel.fate, DELIVERED, now)
         if not due and self._hub.bus.raw_listened:
             self._hub.sent(Frame(NOBODY, EVERYONE, PACKET, b"", self.codec.protocol), wire, Way(self.name, took[0]))

@@ -66,6 +66,7 @@ class Report:
         return [self._link(link, robots) for link in self._exchange.links.values()]
 
     def _link(self, link: Link, robots: Sequence[table.Route]) -> LinkMessage:
+        p50, p99 = (None if ms is None else round(ms, 3) for ms in link.delays.ms(link.frames_out) or (None, None))
         return LinkMessage(
             name=link.name,
             adapter=link.configuration.adapter_name,
@@ -79,6 +80,8 @@ class Report:
             frames_out=link.frames_out,
             malformed=link.malformed,
             queued=link.outbox.size,
+            delay_p50_ms=p50,
+            delay_p99_ms=p99,
             reopened=max(link.opened - 1, 0),
             unasked=self._exchange.allowances[link.name].refused,
             last_heard=None if link.last_heard is None else self.moment(link.last_heard),

@@ -268,9 +268,9 @@ class Resident:
         """Do for the sender of `frame`, in words, what a robot of bytes is told; answer in the robot's name."""
         word, *words = frame.payload.decode("ascii", "replace").split() or [frame.subject]
         name = str(route.robot)
-        max_age_s = self._exchange.links[route.way.link].configuration.options.max_age_s
+        longest_s = self._exchange.links[route.way.link].configuration.options.longest_wait_s(word)
         try:
-            answer = await self._calling.ask(route, word, words, fresh_s=max_age_s - (self._clock() - arrived))
+            answer = await self._calling.ask(route, word, words, fresh_s=longest_s - (self._clock() - arrived))
         except CallError as error:
             log.debug("%s told %s %s: %s", frame.source, name, word, error)
             told = self._responder.refused(frame, name, self._clock())

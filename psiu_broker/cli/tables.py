@@ -68,7 +68,8 @@ def links(connection: Connection) -> None:
     """List the links, their state, and what those that are not open wait for.
 
     In a pipe each line has, between tabs: link, adapter, protocol, state, reason, robots, frames in, frames out,
-    malformed, queued, times reopened, peers, broker. With --json: a list (psiu schema Link).
+    malformed, queued, times reopened, peers, broker, and how long the last 1000 frames out had waited to leave, p50 and
+    p99 in ms. With --json: a list (psiu schema Link).
 
     On a terminal the trunks to other brokers follow, where there are any; a program gets them from the key
     psiu/@broker/{broker}/trunks (psiu schema Trunk).
@@ -190,7 +191,8 @@ def _span(low: int | None, high: int | None) -> str:
 
 def show_links(found: Links, *, drawn: bool) -> None:
     if drawn:
-        heads = ("link", "adapter", "protocol", "state", "robots", "in", "out", "malformed", "queued", "reopened")
+        counted = ("robots", "in", "out", "malformed", "queued", "waited ms", "reopened")
+        heads = ("link", "adapter", "protocol", "state", *counted)
         rows = [(broker, _link(link)) for broker, link in found]
         nothing = "The broker has no links: add [links.NAME] to its configuration."
         print_table(*_with_brokers(heads, rows), nothing)
@@ -202,7 +204,7 @@ def show_links(found: Links, *, drawn: bool) -> None:
         return
     print_rows(
         (link.name, link.adapter, link.protocol, link.state, link.reason, link.robots, link.frames_in, link.frames_out,
-         link.malformed, link.queued, link.reopened, " ".join(link.peers), broker)
+         link.malformed, link.queued, link.reopened, " ".join(link.peers), broker, link.delay_p50_ms, link.delay_p99_ms)
         for broker, link in found
     )  # fmt: skip
 
@@ -303,7 +305,8 @@ def _robot(card: Card) -> Sequence[Cell]:
 
 
 def _link(link: Link) -> Sequence[Cell]:
-    counts = (link.robots, link.frames_in, link.frames_out, link.malformed, link.queued, link.reopened)
+    waited = None if link.delay_p99_ms is None else f"{link.delay_p50_ms or 0:.3g}–{link.delay_p99_ms:.3g}"
+    counts = (link.robots, link.frames_in, link.frames_out, link.malformed, link.queued, waited, link.reopened)
     return link.name, link.adapter, link.protocol, link.state, *counts
 
 

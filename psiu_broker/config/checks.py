@@ -8,7 +8,8 @@ from ipaddress import ip_address
 from typing import Final
 
 from psiu_broker.adapter import Adapter, Peer
-from psiu_broker.codecs.codec import Directory
+from psiu_broker.codecs.codec import Codec, Directory
+from psiu_broker.codecs.paced import PacedCodec
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.codecs.soccer import Soccer, rate_trouble
 from psiu_broker.config.certificates import problem
@@ -128,6 +129,16 @@ def check_rate(adapter: Adapter, codec: Soccer.Options, key: Key, problems: Prob
     trouble = rate_trouble(codec, adapter.bits_per_second)
     if trouble is not None:
         problems.add((*key, "rate_hz"), trouble)
+
+
+def check_paced(codec: type[Codec], written: Collection[str], key: Key, problems: Problems) -> None:
+    """Packets that leave at a fixed rate, with the newest for every robot, leave nothing to limit or to replace."""
+    if not issubclass(codec, PacedCodec):
+        return
+    for option in ("newest_wins", "max_frames_s", "max_bytes_s", "limits"):
+        if option in written:
+            text = f"{codec.protocol} sends packets at rate_hz, each with the newest for every robot; remove it"
+            problems.add((*key, option), text)
 
 
 def check_identities(

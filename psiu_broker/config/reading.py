@@ -22,6 +22,7 @@ from psiu_broker.config.checks import (
     check_identities,
     check_keys,
     check_nodes,
+    check_paced,
     check_rate,
     check_trunk,
     warnings_about,
@@ -151,7 +152,7 @@ def _link(
     options = problems.read(LinkOptions, _share(table, LinkOptions), key)
     adapter = problems.read(adapter_model, _share(table, adapter_model), key) if adapter_model else None
     codec = None
-    if codec_model:
+    if protocol and codec_model:
         mine = _share(table, codec_model)
         if codec_model is PsiuHexa.Options:
             mine = _with_ends(name, mine, robots, own_address, problems)
@@ -164,6 +165,7 @@ def _link(
             check_far_end(adapter, codec, table, key, problems)
         if adapter and isinstance(codec, Soccer.Options):
             check_rate(adapter, codec, key, problems)
+        check_paced(CODECS[protocol], table, key, problems)
     persona = _persona(table, protocol, key, problems) if options and options.plays is not None else None
     if adapter_model and codec_model:
         models: tuple[type[BaseModel], ...] = (adapter_model, codec_model, LinkOptions)

@@ -3,15 +3,16 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.config.problems import got
 from psiu_broker.frame import EVERYONE, Address
 from psiu_broker.profiles.persona import PersonaOptions
 from psiu_broker.profiles.profile import RobotOptions
+from psiu_broker.routing.outbox import is_question
 
 
 def robot_name(name: str) -> str:
@@ -133,11 +134,47 @@ class MeshConfiguration(_Table):
     discover: bool = Field(False, description="find other brokers on the local network by multicast")
 
 
+def _subject(pattern: str) -> str:
+    if not re.fullmatch(r"[!-~]+", pattern):
+        raise ValueError(
+            f"expected one word, * for any letters, got {got(pattern)}; write it like parafrente or node/*"
+        )
+    return pattern
+
+
+Subject = Annotated[str, AfterValidator(_subject)]
+PerSecond = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+
+
+class SubjectLimit(_Table):
+    """What may be written in ``limits.SUBJECT`` of a link."""
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1})
+
+    frames_s: PerSecond | None = Field(None, description="so many such frames a second")
+    bytes_s: PerSecond | None = Field(None, description="so many bytes of such frames a second")
+
+    @model_validator(mode="after")
+    def _is_limit(self) -> Self:
+        if self.frames_s is None and self.bytes_s is None:
+            raise ValueError("expected frames_s or bytes_s, got neither; write {frames_s = 10}, or leave it out")
+        return self
+
+
 class LinkOptions(_Table):
     """What may be written in every ``[links.NAME]``, whatever its adapter and protocol."""
 
     queue_frames: int = Field(64, ge=1, le=100_000, description="frames that may wait to be sent")
     max_age_s: Seconds = Field(2.0, description="a frame that waited longer is dropped: nothing late moves a robot")
+    question_max_age_s: Seconds = Field(4.0, description="the same for questions about a robot, which move none")
+    newest_wins: tuple[Subject, ...] = Field(
+        (), description="subjects, such as node/*, of which only the newest for each robot waits to be sent"
+    )
+    max_frames_s: PerSecond | None = Field(None, description="frames sent a second, stops aside; more have to wait")
+    max_bytes_s: PerSecond | None = Field(None, description="bytes sent a second, stops aside; more have to wait")
+    limits: Mapping[Subject, SubjectLimit] = Field(
+        {}, description="frames_s and bytes_s of a subject, such as node/*; the first that fits counts"
+    )
     route_age_s: Seconds = Field(300.0, description="a robot not heard for so long is forgotten")
     timeout_s: Seconds = Field(2.0, description="how long a robot may take to answer, one try")
     retries: int = Field(2, ge=0, le=100, description="how often a question is asked again after silence")
@@ -147,6 +184,10 @@ class LinkOptions(_Table):
     wildcard: bool = Field(True, description="frames to ?? are sent on this link")
     greet: bool = Field(True, description="ask who is there when the link opens")
     plays: str | None = Field(None, description="the robot that programs at the far end find there, and command")
+
+    def longest_wait_s(self, command: str) -> float:
+        """How old a frame with that command word may be when it is sent."""
+        return self.question_max_age_s if is_question(command) else self.max_age_s
 
 
 class RobotTable(_Table):

@@ -4,7 +4,8 @@ Where two radios hear one robot, or brokers stand in a ring, one frame arrives b
 The first way that brought it leads; the same frame by another way within the window is a double.
 By the leading way it is a repeat (a person who presses twice) and passes.
 
-The window must be longer than a frame can take by the slowest way, or it would go round for ever.
+The window must be longer than a frame can take by the slowest way, or it would go round for ever;
+questions, which may wait longer than what moves a robot, have a window of their own.
 Far ends of one link (UDP peers) are ways too, but quick ones, and a program may well send each of
 its commands from a new port: among them the window is `same_link_s`.
 """
@@ -13,15 +14,26 @@ from collections.abc import Hashable
 from math import inf
 
 from psiu_broker.frame import MESH, Way
+from psiu_broker.routing.outbox import is_question
 
 
 class Duplicates:
-    """Remembers each frame for at least `window_s`, in two generations so that forgetting costs nothing."""
+    """Remembers each frame for at least its window, in two generations so that forgetting costs nothing."""
 
-    __slots__ = ("_capacity", "_new", "_old", "_same_link_s", "_until", "_window_s")
+    __slots__ = ("_capacity", "_generation_s", "_new", "_old", "_question_s", "_same_link_s", "_until", "_window_s")
 
-    def __init__(self, window_s: float = 4.0, same_link_s: float = 0.25, *, capacity: int = 16_384) -> None:
+    def __init__(
+        self,
+        window_s: float = 4.0,
+        same_link_s: float = 0.25,
+        *,
+        question_s: float | None = None,
+        capacity: int = 16_384,
+    ) -> None:
+        """`question_s`: the window of questions; default: `window_s`."""
         self._window_s = window_s
+        self._question_s = window_s if question_s is None else question_s
+        self._generation_s = max(self._window_s, self._question_s)
         self._same_link_s = same_link_s
         self._capacity = capacity
         self._new: dict[Hashable, tuple[Way, float]] = {}
@@ -29,18 +41,18 @@ class Duplicates:
         self._until = -inf
         """When the new generation becomes the old one."""
 
-    def is_double(self, key: Hashable, way: Way, now: float) -> bool:
-        """Note the frame `key` heard on `way`; True if it came by another way less than the window ago."""
+    def is_double(self, key: Hashable, way: Way, now: float, subject: str = "") -> bool:
+        """Note the frame `key` about `subject` heard on `way`; True if it came by another less than the window ago."""
         if now > self._until:
             self._old = self._new
             self._new = {}
-            self._until = now + self._window_s
+            self._until = now + self._generation_s
         new = self._new
         hearing = (way, now)
         seen = new.setdefault(key, hearing)
         if seen is hearing:
             before = self._old.get(key)
-            if before is not None and self._is_another(before, way, now):
+            if before is not None and self._is_another(before, way, now, subject):
                 if before[0].link == MESH:
                     new[key] = self._leading(before, way)
                 else:
@@ -48,12 +60,17 @@ class Duplicates:
                 return True
             if len(new) >= self._capacity:
                 self._until = -inf
-        elif seen[0] is not way and self._is_another(seen, way, now):
+        elif seen[0] is not way and self._is_another(seen, way, now, subject):
             new[key] = self._leading(seen, way)
             return True
         else:
             new[key] = hearing
         return False
+
+    def knows(self, key: Hashable, way: Way, now: float, subject: str = "") -> bool:
+        """Whether the frame `key` about `subject`, were it heard on `way` now, would be a double; notes nothing."""
+        seen = self._new.get(key) or self._old.get(key)
+        return seen is not None and self._is_another(seen, way, now, subject)
 
     def heard_here(self, key: Hashable, since: float) -> bool:
         """Whether a link of ours, and not only another broker, brought the frame `key` at `since` or later."""
@@ -71,9 +88,12 @@ class Duplicates:
             for key in led:
                 del generation[key]
 
-    def _is_another(self, seen: tuple[Way, float], way: Way, now: float) -> bool:
+    def _is_another(self, seen: tuple[Way, float], way: Way, now: float, subject: str) -> bool:
         """Whether what was `seen` came by another way than `way`, and so lately that this is its double."""
         if seen[0] == way:
             return False
-        window_s = self._same_link_s if seen[0].link == way.link else self._window_s
+        if seen[0].link == way.link:
+            window_s = self._same_link_s
+        else:
+            window_s = self._question_s if is_question(subject) else self._window_s
         return now - seen[1] <= window_s

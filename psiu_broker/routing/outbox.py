@@ -1,7 +1,7 @@
 """What waits for one link: bounded, urgent first, and never late."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator
 from itertools import chain
 from typing import Final, NamedTuple
 
@@ -19,17 +19,33 @@ STOP_WORDS: Final = frozenset({"pare", "parar", "para", "stop"})
 
 QUESTION_WORDS: Final = frozenset({"qualseunome", "quantoscomandos", "exibecomando", "exibecomandos"})
 
+STATUS_WORDS: Final = frozenset({b"sucesso", b"ok", b"respok", b"falha", b"respfalha"})
+"""What follows the command word in an answer of PSIU ASCII."""
+
 
 def is_stop(command: str) -> bool:
     """Whether `command`, in any case, overtakes everything that waits."""
     return command.lower() in STOP_WORDS
 
 
+def is_question(command: str) -> bool:
+    """Whether `command`, in any case, asks about a robot, which moves none."""
+    return command.lower() in QUESTION_WORDS
+
+
+def is_answer(frame: Frame) -> bool:
+    """Whether `frame` says how a command went: it moves nobody, and each is awaited by somebody."""
+    return frame.protocol == "psiu-ascii" and any(
+        word.lower() in STATUS_WORDS for word in frame.payload.split(maxsplit=2)[1:2]
+    )
+
+
 def lane(frame: Frame) -> int:
     """The lane of `frame`: stops before commands and answers, these before questions about a robot."""
-    if is_stop(frame.subject):
+    word = frame.subject.lower()
+    if word in STOP_WORDS and not is_answer(frame):
         return STOP_LANE
-    return QUESTION_LANE if frame.subject in QUESTION_WORDS else COMMAND_LANE
+    return QUESTION_LANE if word in QUESTION_WORDS else COMMAND_LANE
 
 
 class Fate:
@@ -56,13 +72,18 @@ class Fate:
 
 
 class Parcel(NamedTuple):
-    """One copy of a frame, encoded for its link, and until when it is worth sending."""
+    """One copy of a frame, encoded for its link; since when it waits, and until when it is worth sending."""
 
     wire: bytes
     peer: object
     lane: int
+    since: float
     expires: float
     fate: Fate
+    limit: str | None = None
+    """The limit that its subject shares, if any does."""
+    key: Hashable = None
+    """Of a set-point: a newer one with the same key takes its place."""
 
 
 class Outbox:
@@ -95,6 +116,19 @@ class Outbox:
         self.size += 1
         return evicted
 
+    def swap(self, newer: Parcel) -> Parcel | None:
+        """Put `newer` where one with its key waits, and return that; None, and nothing changed, where none does.
+
+        The newer one leaves when the older would have, so that a stream of set-points starves nobody and is not
+        starved by itself; its age is its own.
+        """
+        waiting = self._lanes[newer.lane]
+        for place, older in enumerate(waiting):
+            if older.key == newer.key:
+                waiting[place] = newer
+                return older
+        return None
+
     def overtaken(self, stop: Parcel) -> list[Parcel]:
         """Take out what waits for the robot that `stop` is for and would, behind it, move it again."""
         robot = stop.fate.frame.destination
@@ -103,18 +137,25 @@ class Outbox:
                 older.lane == COMMAND_LANE
                 and older.peer == stop.peer
                 and robot in (EVERYONE, older.fate.frame.destination)
+                and not is_answer(older.fate.frame)
             )
         )
 
-    def waits_for(self, peer: object) -> bool:
-        """Whether anything waits for `peer`: then what comes later must wait behind it."""
-        return any(parcel.peer == peer for parcel in self)
+    def before(self, lane: int) -> Iterator[Parcel]:
+        """What would leave before a parcel that is put into `lane` now."""
+        return chain(*self._lanes[: lane + 1])
 
-    def take(self, passing_over: Collection[object] = ()) -> Parcel | None:
-        """The next parcel to send, to a peer that is not among `passing_over`."""
+    def waits_for(self, peer: object, lane: int) -> bool:
+        """Whether anything waits for `peer` that what comes later in `lane` must wait behind."""
+        return any(parcel.peer == peer for parcel in self.before(lane))
+
+    def take(
+        self, passing_over: Collection[object] = (), held: Callable[[Parcel], bool] | None = None
+    ) -> Parcel | None:
+        """The next parcel to send, to a peer that is not among `passing_over`, and that is not `held` back."""
         for lane in self._lanes:
             for place, parcel in enumerate(lane):
-                if parcel.peer not in passing_over:
+                if parcel.peer not in passing_over and not (held is not None and held(parcel)):
                     del lane[place]
                     self.size -= 1
                     return parcel

@@ -105,7 +105,7 @@ class Router:
 
     def route(self, frame: Frame, arrived: Way, now: float) -> Decision:
         """Decide for a frame that arrived, and learn from it."""
-        if self._duplicates.is_double(self._identity(frame), arrived, now):
+        if self._duplicates.is_double(self._identity(frame), arrived, now, frame.subject):
             return self._note_double(frame, arrived, now)
         routes = self._routes
         source = routes.get(frame.source)
@@ -123,7 +123,7 @@ class Router:
 
     def sent(self, frame: Frame, now: float) -> None:
         """A frame of our own left without being routed: what comes round of it is a double."""
-        self._duplicates.is_double(self._identity(frame), SELF, now)
+        self._duplicates.is_double(self._identity(frame), SELF, now, frame.subject)
 
     def decide(self, destination: Address, protocol: str, arrived: Way) -> Decision:
         """What `route` decides for a frame of `protocol` from `arrived`, doubles aside. Changes nothing."""

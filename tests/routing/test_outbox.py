@@ -12,7 +12,7 @@ def frame(subject: str = "parafrente") -> Frame:
 
 
 def parcel(name: str, lane: int = COMMAND_LANE, expires: float = 10.0, peer: object = None) -> Parcel:
-    return Parcel(name.encode(), peer, lane, expires, Fate(frame(), ARRIVED))
+    return Parcel(name.encode(), peer, lane, 0.0, expires, Fate(frame(), ARRIVED))
 
 
 def names(parcels: list[Parcel]) -> str:

@@ -10,7 +10,7 @@ from psiu_broker.routing.set_points import SetPoints
 
 def parcel(robot: int, lane: int = COMMAND_LANE, expires: float = 9.0, peer: object = None) -> Parcel:
     frame = Frame(NOBODY, Address.numbered(robot), "rodas", b"", "soccer")
-    return Parcel(b"", peer, lane, expires, Fate(frame, Way("wifi")))
+    return Parcel(b"", peer, lane, 0.0, expires, Fate(frame, Way("wifi")))
 
 
 def test_a_newer_set_point_takes_the_place_of_its_robot_s_older_one() -> None:
