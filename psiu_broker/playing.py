@@ -28,6 +28,8 @@ CALLS_KEPT: Final = 16
 """How many calls of one program may wait for those before them."""
 STOPS_KEPT: Final = 8
 """How many stops of one program may wait for their answers; of any more the answers are not waited for."""
+SHORTEST_S: Final = 0.001
+"""A persona that wants its turn at once, and always again, takes no more of the loop's time than this leaves it."""
 STOPPED: Final = "a stop came meanwhile"
 
 log = logging.getLogger(__name__)
@@ -60,6 +62,7 @@ class Playing:
             name: ends(configuration, link) for name, link in configuration.links.items() if link.options.plays
         }
         self._programs: dict[Way, Program] = {}
+        self._closed = False
 
     def link_opened(self, link: Link, now: float) -> None:
         """Where a link has one far end, the program is there now."""
@@ -96,6 +99,7 @@ class Playing:
 
     async def close(self) -> None:
         """Forget every program, and wait until nothing is done for it any more."""
+        self._closed = True
         tasks = [task for program in self._programs.values() for task in program.tasks]
         self._forget(list(self._programs))
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -105,7 +109,7 @@ class Playing:
         if program is not None:
             return program
         played = self._played.get(way.link)
-        if played is None:
+        if played is None or self._closed:
             return None
         configuration = self._exchange.links[way.link].configuration
         persona = PROTOCOLS[configuration.protocol].persona
@@ -217,7 +221,8 @@ class Program:
             self._start_stop(asked)
             return True
         if call.newest:
-            self._newest[call.command] = asked
+            # What moves it forwards and backwards may be one letter of the program, of which the newest value counts.
+            self._newest[call.command if call.asked is None else call.asked.subject] = asked
         elif len(self._waiting) < CALLS_KEPT:
             self._waiting.append(asked)
         else:
@@ -292,7 +297,7 @@ class Program:
             self._timer.cancel()
             self._timer = None
         if until is not None and not self._ended:
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, until - now), self._due)
+            self._timer = asyncio.get_running_loop().call_later(max(SHORTEST_S, until - now), self._due)
 
     def _due(self) -> None:
         self._timer = None

@@ -39,7 +39,7 @@ from psiu_broker.routing.table import Route
 
 MNERIM, BASE = Address.named("MNERIM"), Address.named("base")
 MAP = {
-    "D": {"command": "parafrente", "at_zero": "pare", "scale": 1},
+    "D": {"command": "parafrente", "below_zero": "paratras", "at_zero": "pare", "scale": 1},
     "y": {"command": "acena"},
     "n": {"command": "nega"},
 }
@@ -141,6 +141,32 @@ async def test_a_set_point_that_waited_for_its_turn_is_not_sent_after_a_stop() -
         made.hears("radio", words("pare", "sucesso"))
         made.hears("painel", b"G0064")  # the same again is news after a stop
         await until(lambda: made.told == ["paratras 50", "pare", "parafrente 100"])
+
+
+async def test_of_one_letter_only_the_newest_value_counts_whichever_way_it_moves_the_robot() -> None:
+    async with lab(radio(), panel()) as made:
+        call = asyncio.create_task(made.resident.call(MNERIM, "giradireita", CallRequest(parameters=[90])))
+        await until(lambda: made.told == ["giradireita 90"])
+        made.hears("painel", b"y0001")
+        await asyncio.sleep(0.02)
+        for value in (b"G0032", b"GFFCE", b"G0014"):
+            made.hears("painel", value)
+        made.hears("radio", words("giradireita", "sucesso"))
+        await call
+        await until(lambda: made.told[1:2] == ["acena"])
+        made.hears("radio", words("acena", "sucesso"))
+        await until(lambda: made.told[2:] == ["parafrente 20"])
+        await asyncio.sleep(0.02)
+        assert made.told[2:] == ["parafrente 20"]
+
+
+async def test_a_broker_that_is_stopping_does_nothing_for_programs_any_more() -> None:
+    async with lab(radio(), panel()) as made:
+        await made.resident.close()
+        made.hears("painel", b"y0001")
+        await asyncio.sleep(0)
+        assert made.exchange.accounts["painel"].fates["refused"] == 1
+        assert len(asyncio.all_tasks()) == 1
 
 
 async def test_what_waited_too_long_behind_other_calls_of_its_program_is_not_sent() -> None:

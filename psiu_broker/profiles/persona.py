@@ -22,9 +22,9 @@ class Say(NamedTuple):
 
 
 class Call(NamedTuple):
-    """Something for the robot that is played. Of those that are `newest`, only the newest of each command counts.
+    """Something for the robot that is played. `asked` is the frame that it is done for, which may want an answer.
 
-    `asked` is the frame that it is done for, which may want an answer.
+    Of those that are `newest`, only the newest of each subject of `asked` counts; without one, of each command.
     """
 
     command: str
