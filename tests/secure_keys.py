@@ -13,7 +13,7 @@ PROGRAMS = ("operator", "screen", "stranger")
 def make_keys(folder: Path, brokers: Sequence[str] = BROKERS, programs: Sequence[str] = PROGRAMS) -> Path:
     authority = Authority(folder)
     for name in (*brokers, *programs):
-        authority.make(name, 30, broker=name in brokers)
+        authority.make(name, 365, broker=name in brokers)
     return folder
 
 

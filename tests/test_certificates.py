@@ -109,21 +109,21 @@ def test_a_key_that_others_may_read_is_refused_with_what_to_run(keys: Path, owne
     ("left", "expected"),
     [
         (SOON + timedelta(minutes=1), None),
-        (SOON - timedelta(minutes=1), r"ends on 20\d\d-\d\d-\d\d, in 29 days; make another: psiu-broker keys \S+ base"),
+        (SOON - timedelta(minutes=1), r"ends on 20\d\d-\d\d-\d\d, in 29 days; make another where .*--broker base --renew$"),
         (timedelta(0), r"ended on 20\d\d-\d\d-\d\d: nobody lets its owner in; make another"),
         (timedelta(days=800), r"is valid from 20\d\d-\d\d-\d\d on, and today is 20\d\d-\d\d-\d\d: is it\?"),
     ],
 )
 def test_a_certificate_that_is_about_to_end_is_told_of(tmp_path: Path, left: timedelta, expected: str | None) -> None:
     Authority(tmp_path, NOW).make("base", 700, broker=True)
-    told = list(warnings(files(tmp_path, "base"), NOW + timedelta(days=700) - left))
+    told = list(warnings(files(tmp_path, "base"), NOW + timedelta(days=700) - left, serves=True))
     own = [text for option, text in told if option == "certificate"]
     assert [re.search(expected, text) is not None for text in own] == ([True] if expected else []), own
 
 
 def test_an_authority_that_is_about_to_end_is_told_of(tmp_path: Path) -> None:
     Authority(tmp_path, NOW).make("base", 3650, broker=True)
-    told = list(warnings(files(tmp_path, "base"), NOW + timedelta(days=3640)))
+    told = list(warnings(files(tmp_path, "base"), NOW + timedelta(days=3640), serves=True))
     assert [option for option, _ in told] == ["ca", "certificate"]
 
 

@@ -119,7 +119,7 @@ def _tls(keys: str) -> TlsConfiguration:
     tls = TlsConfiguration(ca=str(folder / "ca.pem"), certificate=f"{path}.pem", key=f"{path}.key")
     if (found := problem(tls, serves=False)) is not None:
         raise click.UsageError(f"--keys {keys}: {found[1]}")
-    for _, text in warnings(tls, datetime.now(UTC)):
+    for _, text in warnings(tls, datetime.now(UTC), serves=False):
         click.echo(f"warning: {text}", err=True)
     return tls
 

@@ -14,7 +14,6 @@ from typing import Final, NamedTuple, Protocol
 SOON: Final = timedelta(days=30)
 
 _COMMON_NAME: Final = b"\x55\x04\x03"
-_SEQUENCE: Final = 0x30
 _VERSION: Final = 0xA0
 _UTC_TIME: Final = 0x17
 _ANY_TIME: Final = 0x200000
@@ -61,12 +60,10 @@ def read_certificate(path: str) -> Certificate:
 def parse(der: bytes) -> Certificate:
     """Read an X.509 certificate; raises ValueError where it is none. It is not verified."""
     [(_, whole)] = _items(der)
-    _, signed = next(_items(whole))
-    fields = [item for item in _items(signed) if item[0] != _VERSION]
-    if len(fields) < 5:  # serial number, signature, issuer, validity, subject
-        raise ValueError("not a certificate")
-    since, until = (_time(tag, text) for tag, text in _items(fields[3][1]))
-    return Certificate(_common_name(fields[4][1]), since, until)
+    (_, signed), _, _ = _items(whole)
+    _, _, _, (_, validity), (_, subject), *_ = (item for item in _items(signed) if item[0] != _VERSION)
+    since, until = (_time(tag, text) for tag, text in _items(validity))
+    return Certificate(_common_name(subject), since, until)
 
 
 def problem(files: Files, *, serves: bool) -> tuple[str, str] | None:
@@ -93,7 +90,7 @@ def problem(files: Files, *, serves: bool) -> tuple[str, str] | None:
     return _mismatch(files, serves=serves)
 
 
-def warnings(files: Files, now: datetime) -> Iterator[tuple[str, str]]:
+def warnings(files: Files, now: datetime, *, serves: bool) -> Iterator[tuple[str, str]]:
     """What is not valid at `now`, or not for long, as option and text; of files without a `problem`."""
     for option in ("ca", "certificate"):
         path = getattr(files, option)
@@ -102,16 +99,17 @@ def warnings(files: Files, now: datetime) -> Iterator[tuple[str, str]]:
         if now < certificate.since:
             yield option, f"{path} is valid from {certificate.since:%Y-%m-%d} on, and today is {now:%Y-%m-%d}: is it?"
         elif certificate.until <= now:
-            yield option, f"{path} ended on {day}: nobody lets its owner in; {_renewal(path, option)}"
+            yield option, f"{path} ended on {day}: nobody lets its owner in; {_renewal(path, option, serves)}"
         elif certificate.until - now < SOON:
             days = (certificate.until - now).days
-            yield option, f"{path} ends on {day}, in {days} days; {_renewal(path, option)}"
+            yield option, f"{path} ends on {day}, in {days} days; {_renewal(path, option, serves)}"
 
 
-def _renewal(path: str, option: str) -> str:
+def _renewal(path: str, option: str, serves: bool) -> str:
     if option == "ca":
-        return "make a new folder of keys: psiu-broker keys"
-    return f"make another: psiu-broker keys {Path(path).parent} {Path(path).stem} --renew"
+        return "make keys in a new folder, for everybody: psiu-broker keys"
+    who = f"--{'broker' if serves else 'program'} {Path(path).stem}"
+    return f"make another where ca.key is: psiu-broker keys FOLDER {who} --renew"
 
 
 def _too_open(path: str) -> str | None:
