@@ -229,6 +229,10 @@ class Link(Kept):
             return LINK_DOWN
         return self._queue(parcel, now)
 
+    def is_named(self, peer: Peer) -> bool:
+        """As `Transport.is_named`."""
+        return self._transport is not None and self._transport.is_named(peer)
+
     def ways(self) -> tuple[Way, ...]:
         """Every far end there is now."""
         if self._transport is None:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from ipaddress import ip_address
 from typing import Final
@@ -17,10 +17,12 @@ from psiu_broker.config.certificates import warnings as validity
 from psiu_broker.config.problems import Key, Problems, got, suggestion
 from psiu_broker.config.tables import (
     ENDPOINT,
+    LINK_NAME,
     AccessConfiguration,
     BrokerConfiguration,
     LinkConfiguration,
     MeshConfiguration,
+    PolicyRule,
     RobotConfiguration,
     TrunkConfiguration,
     ZenohConfiguration,
@@ -182,6 +184,20 @@ def check_ends(
     for link in links.values():
         if link.options.plays is not None:
             _check_played(link, link.options.plays, robots, problems)
+
+
+def check_policy(
+    rules: Sequence[PolicyRule | None], links: Collection[str], broker: BrokerConfiguration | None, problems: Problems
+) -> None:
+    """A rule is about links that there are, and about robots."""
+    for position, rule in enumerate(rules):
+        for link in () if rule is None else rule.link:
+            if LINK_NAME.fullmatch(link) and link not in links:
+                known = suggestion(link, links) if links else "add one"
+                problems.add(("policy", position, "link"), f"there is no link {got(link)}; {known}")
+        if rule is not None and broker is not None and rule.destination == (broker.name,):
+            text = f"{broker.name} is this broker: what is said to it moves nobody, and always passes; name a robot"
+            problems.add(("policy", position, "destination"), text)
 
 
 def _is_addressed(link: LinkConfiguration) -> bool:

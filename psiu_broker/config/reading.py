@@ -23,6 +23,7 @@ from psiu_broker.config.checks import (
     check_keys,
     check_nodes,
     check_paced,
+    check_policy,
     check_rate,
     check_trunk,
     warnings_about,
@@ -36,6 +37,7 @@ from psiu_broker.config.tables import (
     LinkConfiguration,
     LinkOptions,
     MeshConfiguration,
+    PolicyRule,
     RobotConfiguration,
     RobotTable,
     TrunkConfiguration,
@@ -99,7 +101,7 @@ def _syntax(path: Path, message: str) -> str:
 
 def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> Configuration | None:
     """What the file says; None where it is wrong, with every mistake noted."""
-    sections = ("broker", "zenoh", "mesh", "links", "trunks", "robots")
+    sections = ("broker", "zenoh", "mesh", "policy", "links", "trunks", "robots")
     for name in document:
         if name not in sections:
             problems.unknown((name,), sections)
@@ -113,6 +115,8 @@ def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> 
     trunks_written = problems.table(document.get("trunks", {}), ("trunks",)) or {}
     trunks = {name: trunk for name, value in trunks_written.items() if (trunk := _trunk(name, value, problems))}
     robots = {name: _robot(name, value, links, problems) for name, value in robots_written.items()}
+    policy = _policy(document.get("policy", []), problems)
+    check_policy(policy, links, broker, problems)
     whole_links = {name: link for name, link in links.items() if link}
     whole_robots = {name: robot for name, robot in robots.items() if robot}
     check_devices(whole_links.values(), trunks.values(), problems)
@@ -127,7 +131,8 @@ def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> 
     if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
     warnings = warnings_about(str(file), zenoh, mesh, whole_links.values(), trunks.values(), datetime.now(UTC))
-    return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks, mesh)
+    rules = tuple(rule for rule in policy if rule is not None)
+    return Configuration(broker, zenoh, whole_links, whole_robots, warnings, trunks, mesh, rules)
 
 
 def _with_files(zenoh: ZenohConfiguration, folder: Path) -> ZenohConfiguration:
@@ -136,6 +141,14 @@ def _with_files(zenoh: ZenohConfiguration, folder: Path) -> ZenohConfiguration:
         return zenoh
     files = {option: str(folder.absolute() / path) for option, path in zenoh.tls}
     return zenoh.model_copy(update={"tls": zenoh.tls.model_copy(update=files)})
+
+
+def _policy(value: object, problems: Problems) -> list[PolicyRule | None]:
+    """The rules, in their order; None for each that is wrong."""
+    if not isinstance(value, list):
+        problems.add(("policy",), f"expected rules, got {got(value)}; write [[policy]] above each")
+        return []
+    return [problems.read(PolicyRule, rule, ("policy", position)) for position, rule in enumerate(value)]
 
 
 def _link(

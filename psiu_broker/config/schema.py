@@ -9,6 +9,7 @@ from psiu_broker.config.tables import (
     BrokerConfiguration,
     LinkOptions,
     MeshConfiguration,
+    PolicyRule,
     RobotTable,
     ZenohConfiguration,
 )
@@ -64,6 +65,7 @@ def json_schema() -> dict[str, Any]:
             "broker": schema(BrokerConfiguration),
             "zenoh": schema(ZenohConfiguration),
             "mesh": schema(MeshConfiguration),
+            "policy": {"type": "array", "items": schema(PolicyRule)},
             "links": {
                 "type": "object",
                 "propertyNames": names,

@@ -11,6 +11,7 @@ def shown(configuration: Configuration) -> dict[str, Any]:
         "broker": configuration.broker.model_dump(mode="json"),
         "zenoh": configuration.zenoh.model_dump(mode="json"),
         "mesh": configuration.mesh.model_dump(mode="json"),
+        "policy": [rule.model_dump(mode="json") for rule in configuration.policy],
         "links": {name: _link(link) for name, link in configuration.links.items()},
         "trunks": {name: _trunk(trunk) for name, trunk in configuration.trunks.items()},
         "robots": {

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.config.problems import got
@@ -161,6 +161,32 @@ class SubjectLimit(_Table):
         return self
 
 
+def _glob(glob: str) -> str:
+    if not glob.isascii() or not glob.isprintable() or glob != glob.strip() or not glob:
+        raise ValueError(f"expected a name, in which * stands for any letters, got {got(glob)}; write it like MNERIM")
+    return glob
+
+
+def _several(globs: object) -> object:
+    return [globs] if isinstance(globs, str) else globs
+
+
+Glob = Annotated[str, AfterValidator(_glob)]
+Globs = Annotated[
+    tuple[Glob, ...], Field(min_length=1), BeforeValidator(_several, json_schema_input_type=Glob | tuple[Glob, ...])
+]
+
+
+class PolicyRule(_Table):
+    """``[[policy]]``: who may command whom. The first rule that fits a command decides."""
+
+    action: Literal["allow", "deny"] = Field(description="whether what fits the rest may pass")
+    source: Globs = Field(("*",), description="who commands: names, or globs such as PC*; programs on Zenoh: the broker")
+    destination: Globs = Field(("*",), description="who is commanded")
+    command: Globs = Field(("*",), description="command words, or node/4 and the like, in any case")
+    link: Globs = Field(("*",), description="where it comes in; @self: from programs on Zenoh, @mesh: from a broker")
+
+
 class LinkOptions(_Table):
     """What may be written in every ``[links.NAME]``, whatever its adapter and protocol."""
 
@@ -183,6 +209,11 @@ class LinkOptions(_Table):
     avr_limits: bool = Field(False, description="the robots have an AVR's small buffers: warn before exceeding them")
     wildcard: bool = Field(True, description="frames to ?? are sent on this link")
     greet: bool = Field(True, description="ask who is there when the link opens")
+    allow: tuple[Glob, ...] | None = Field(None, description="who may command from here, where no [[policy]] decides")
+    deny: tuple[Glob, ...] = Field((), description="who may not command from here, where no [[policy]] decides")
+    new_names_per_minute: int = Field(
+        30, ge=1, le=100_000, description="robots heard here for the first time; more are not listened to"
+    )
     plays: str | None = Field(None, description="the robot that programs at the far end find there, and command")
 
     def longest_wait_s(self, command: str) -> float:
@@ -252,3 +283,4 @@ class Configuration:
     warnings: tuple[str, ...] = ()
     trunks: Mapping[str, TrunkConfiguration] = field(default_factory=dict)
     mesh: MeshConfiguration = field(default_factory=MeshConfiguration)
+    policy: tuple[PolicyRule, ...] = ()

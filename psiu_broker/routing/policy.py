@@ -24,6 +24,22 @@ LONGEST_KEPT: Final = 64
 ANY: Final = ("*",)
 
 
+_Glob = Callable[[str], object] | None
+
+
+def _glob(globs: Sequence[str], *, any_case: bool = False) -> _Glob:
+    """What tells whether one of `globs` fits a text; None where all do."""
+    if "*" in globs:
+        return None
+    # ?? is everyone, and no glob for all names of two letters.
+    patterns = [re.escape(each) if each == str(EVERYONE) else translate(each) for each in globs]
+    return re.compile("|".join(f"(?:{each})" for each in patterns), re.IGNORECASE if any_case else 0).fullmatch
+
+
+def _any(glob: _Glob, texts: Iterable[str]) -> bool:
+    return glob is None or any(glob(text) is not None for text in texts)
+
+
 @dataclass(frozen=True, slots=True)
 class Rule:
     """Whether a command that fits all four is let through; each is a choice of globs, as for file names.
@@ -39,7 +55,7 @@ class Rule:
     link: tuple[str, ...] = ANY
     where: str = ""
     """Where the configuration says so, as ``policy[0]``."""
-    _globs: tuple["_Glob", ...] = field(init=False, repr=False, compare=False)
+    _globs: tuple[_Glob, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         globs = (_glob(self.source), _glob(self.destination), _glob(self.command, any_case=True), _glob(self.link))
@@ -61,7 +77,7 @@ class Rule:
         verb = "allows" if self.allow else "denies"
         return f"{self.where} {verb} {', '.join(told) or 'everything'}"
 
-    def _reaches(self, to: "_Glob", destination: Iterable[str]) -> bool:
+    def _reaches(self, to: _Glob, destination: Iterable[str]) -> bool:
         if to is None:
             return True
         destination = tuple(destination)
@@ -73,21 +89,7 @@ class Rule:
 UNNAMED: Final = Rule(False, where="by default the policy")
 """What stops a command from a stranger beyond this computer."""
 
-_Glob = Callable[[str], object] | None
 _MISSING: Final = Rule(False, where="not decided yet")
-
-
-def _glob(globs: Sequence[str], *, any_case: bool = False) -> _Glob:
-    """What tells whether one of `globs` fits a text; None where all do."""
-    if "*" in globs:
-        return None
-    # ?? is everyone, and no glob for all names of two letters.
-    patterns = [re.escape(each) if each == str(EVERYONE) else translate(each) for each in globs]
-    return re.compile("|".join(f"(?:{each})" for each in patterns), re.IGNORECASE if any_case else 0).fullmatch
-
-
-def _any(glob: _Glob, texts: Iterable[str]) -> bool:
-    return glob is None or any(glob(text) is not None for text in texts)
 
 
 def _nobody(_: Way) -> bool:
@@ -104,7 +106,7 @@ class Policy:
     Args:
         rules: the first that fits decides.
         own: the broker's own addresses.
-        commands: whether a frame is a command, which may move its destination.
+        commands: whether a frame that came by a way is a command, which may move its destination.
         words: what rules may call the command of a frame that is one; the same for every frame of one subject and
             destination, unless that subject is empty.
         exposed: the links that others reach from beyond this computer without leave, with the robots that the
@@ -116,7 +118,7 @@ class Policy:
         self,
         rules: Sequence[Rule] = (),
         own: Collection[Address] = (),
-        commands: Callable[[Frame], bool] = lambda _: True,
+        commands: Callable[[Frame, Way], bool] = lambda *_: True,
         words: Callable[[Frame], Collection[str]] = lambda frame: (frame.subject,),
         exposed: Mapping[str, Collection[Address]] | None = None,
         strange: Callable[[Way], bool] = _nobody,
@@ -144,7 +146,7 @@ class Policy:
             return None
         if found is _MISSING:
             found = self._look_up(frame, arrived)
-        if found is None or not self._commands(frame) or (found is UNNAMED and not self._strange(arrived)):
+        if found is None or not self._commands(frame, arrived) or (found is UNNAMED and not self._strange(arrived)):
             return None
         return found
 
