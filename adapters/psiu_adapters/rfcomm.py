@@ -140,6 +140,7 @@ class Called(DescriptorTransport):
         facts: Mapping[str, str | int | float],
         bluez: Bluez | None = None,
     ) -> None:
+        rfcomm_socket.hold_little(fd)
         super().__init__(fd, receiver, close=lambda: hang_up(fd), name=address)
         self._address = address
         self._facts = facts
@@ -206,6 +207,7 @@ class Accepting(Transport):
             if self._callers.get(address) is caller:
                 self._caller_lost(address)
 
+        rfcomm_socket.hold_little(fd)
         caller = DescriptorTransport(
             fd, _One(self._receiver, lost), peer=address, close=lambda: hang_up(fd), name=address
         )

@@ -4,6 +4,7 @@ Through ctypes, because many builds of Python lack AF_BLUETOOTH in their socket 
 """
 
 import asyncio
+import contextlib
 import ctypes
 import errno
 import os
@@ -14,6 +15,8 @@ from psiu_broker.errors import LinkAbsent, LinkBusy, LinkError
 
 AF_BLUETOOTH = 31
 BTPROTO_RFCOMM = 3
+
+BUFFER_BYTES = 2048
 
 SILENT = {errno.EHOSTDOWN, errno.ETIMEDOUT, errno.ECONNABORTED, errno.ECONNRESET}
 NO_CONTROLLER = {errno.EHOSTUNREACH, errno.ENODEV, errno.ENETDOWN, errno.ENETUNREACH}
@@ -49,6 +52,12 @@ async def connect(address: str, channel: int, timeout_s: float) -> int:
         connection.close()
         raise
     return connection.detach()
+
+
+def hold_little(fd: int) -> None:
+    """Let the kernel keep few frames for the robot: what it has taken no stop can overtake."""
+    with socket.socket(fileno=os.dup(fd)) as connection, contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
 
 
 async def connected(connection: socket.socket, sockaddr: bytes) -> None:

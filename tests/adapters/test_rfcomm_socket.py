@@ -12,7 +12,7 @@ from adapter_contract import Recorder, open_descriptors
 
 from psiu_adapters import rfcomm, rfcomm_socket
 from psiu_adapters.rfcomm import Rfcomm
-from psiu_adapters.rfcomm_socket import connected, explained, sockaddr_rc
+from psiu_adapters.rfcomm_socket import connected, explained, hold_little, sockaddr_rc
 from psiu_broker.adapter import Transport
 from psiu_broker.errors import LinkAbsent, LinkBusy, LinkError
 
@@ -61,6 +61,20 @@ async def test_connecting_can_be_cancelled() -> None:
             connecting.cancel()
             await asyncio.wait({connecting})
             assert connecting.cancelled()
+    assert open_descriptors() == before
+
+
+def test_the_kernel_keeps_few_frames_that_a_stop_cannot_overtake() -> None:
+    before = open_descriptors()
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.setblocking(False)
+        hold_little(ours.fileno())
+        taken = 0
+        with pytest.raises(BlockingIOError):
+            while True:
+                taken += ours.send(b"MNERIM 034 parafrente 100 PC 02123") > 0
+        assert 1 <= taken <= 16
     assert open_descriptors() == before
 
 
