@@ -517,3 +517,49 @@ async def test_a_ping_of_ours_is_known_while_it_waits_and_its_late_answers_are_n
 @jumping
 async def test_hearing_costs_one_look_when_no_call_is_under_way() -> None:
     assert not Robots().conversations.heard(None, 0.0)  # type: ignore[arg-type]
+
+
+@jumping
+async def test_a_motion_that_waited_for_its_turn_is_not_sent_after_a_stop() -> None:
+    robots = Robots()
+    first = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0.1)
+    late = [asyncio.ensure_future(robots.ascii(*each)) for each in (("giradireita", 90), ("quantoscomandos",))]
+    await asyncio.sleep(0.1)
+    robots.script = lambda frame: [(0.05, b"pare sucesso")] if frame.payload == b"pare" else ()
+    assert (await robots.ascii("pare")).status == "sucesso"
+    error = await refused(late[0])
+    assert (error.code, str(error)) == (
+        "expired",
+        "a stop came while MNERIM was at other calls; giradireita was not sent",
+    )
+    robots.script = lambda _: [(0.05, b"quantoscomandos 6")]
+    robots.says(b"parafrente sucesso", MNERIM)
+    await first
+    assert (await late[1]).values == [6], "a question moves nobody"
+    assert robots.payloads == [b"parafrente 100", b"pare", b"quantoscomandos"]
+    assert robots.idle
+
+
+@jumping
+async def test_a_motion_that_was_not_understood_is_not_sent_again_after_a_stop() -> None:
+    robots = Robots()
+    call = asyncio.ensure_future(robots.ascii("parafrente", 100))
+    await asyncio.sleep(0.1)
+    robots.conversations.complained("radio")
+    robots.script = lambda _: [(0.01, b"pare sucesso")]
+    await robots.ascii("pare")
+    assert (await refused(call)).code == "expired"
+    assert robots.payloads == [b"parafrente 100", b"pare"]
+
+
+@jumping
+async def test_a_motion_that_waited_for_a_late_answer_is_not_sent_after_a_stop() -> None:
+    robots = Robots()
+    await robots.conversations.tell(robots.of_words(), "parafrente", [1], fresh_s=1.0)
+    call = asyncio.ensure_future(robots.ascii("parafrente", 100, timeout_s=9))
+    await asyncio.sleep(0.1)
+    robots.script = lambda _: [(0.01, b"pare sucesso")]
+    await robots.ascii("pare")
+    assert (await refused(call)).code == "expired"
+    assert robots.payloads == [b"parafrente 1", b"pare"]

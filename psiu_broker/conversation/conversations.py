@@ -236,6 +236,7 @@ class Conversations:
         if call.is_stop:
             await self._procedures.mend(robot)
             self._refuse_when_closed()
+            self._overtake(call)
             with self.hearing(call):
                 yield
             return
@@ -246,11 +247,21 @@ class Conversations:
             until=call.leave_by,
             replaceable=replaceable,
             alone=call.request.procedure is not None,
+            motion=call.is_motion,
         ):
             await self._procedures.mend(robot)
             self._refuse_when_closed()
             with self.hearing(call):
                 yield
+
+    def _overtake(self, stop: UnderWay) -> None:
+        """What came before `stop` and would move the robot after it is not sent, or not again."""
+        self._turns.overtake(stop.robot.address)
+        for call in self._under_way.get(stop.robot.address, ()):
+            if call.is_motion:
+                call.overtaken = True
+                if not call.sent and not call.waiting:
+                    call.hear(_overtaken(call), 0.0)
 
     @contextmanager
     def hearing(self, call: UnderWay) -> Iterator[None]:
@@ -289,6 +300,8 @@ class Conversations:
         loop = asyncio.get_running_loop()
         tries = 0
         while True:
+            if call.overtaken:
+                raise _overtaken(call)
             until = min(loop.time() + call.patience_s, call.deadline)
             asked_again = call.sent and call.request.question
             self.offer(call, call.request, until if asked_again else min(until, call.leave_by))
@@ -408,6 +421,11 @@ def _under_way(robot: Robot, command: str, request: Request, timeout_s: float, f
     begun = asyncio.get_running_loop().time()
     leave_by = begun + min(timeout_s, fresh_s)
     return UnderWay(robot, command, request, begun, begun + timeout_s, leave_by)
+
+
+def _overtaken(call: UnderWay) -> CallError:
+    again = " again" if call.sent else ""
+    return CallError("expired", f"a stop came for {call.robot.name}; {call.command} was not sent{again}")
 
 
 def _outcome_unknown(call: UnderWay, now: float) -> CallError:

@@ -22,6 +22,9 @@ class _Lane:
     alone: str | None = None
     """The command whose turn it is, where the robot must hear nothing else meanwhile."""
     replaceable: dict[str, asyncio.Timeout] = field(default_factory=dict)
+    motions: set[asyncio.Timeout] = field(default_factory=set)
+    """Those that wait and would move the robot; of them, those before which a stop came."""
+    overtaken: set[asyncio.Timeout] = field(default_factory=set)
 
 
 class Turns:
@@ -43,13 +46,16 @@ class Turns:
         until: float,
         replaceable: bool = False,
         alone: bool = False,
+        motion: bool = False,
     ) -> AsyncIterator[None]:
         """Wait until `until` (the loop's clock) for the turn at `robot`, called `name`; it ends with the body.
 
-        A `replaceable` one that waits is ended by a later one with the same `command`: the newest is what counts.
+        A `replaceable` one that waits is ended by a later one with the same `command`: the newest is what counts;
+        a `motion` that waits, by `overtake`.
 
         Raises:
-            CallError: busy, too many wait or one that is `alone` goes on; expired, no turn came or a newer one did.
+            CallError: busy, too many wait or one that is `alone` goes on; expired, no turn came, or a newer one or a
+                stop did.
         """
         lane = self._lanes.setdefault(robot, _Lane())
         replaces = replaceable and command in lane.replaceable
@@ -57,7 +63,7 @@ class Turns:
             raise CallError("busy", f"{WAITING_KEPT} calls to {name} wait already")
         lane.users += 1
         try:
-            await _acquire(lane, name, command, until, replaceable)
+            await _acquire(lane, name, command, until, replaceable, motion)
             try:
                 lane.alone = command if alone else None
                 yield
@@ -69,13 +75,26 @@ class Turns:
             if lane.users == 0:
                 del self._lanes[robot]
 
+    def overtake(self, robot: Address) -> None:
+        """A stop goes first: end every motion that waits."""
+        lane = self._lanes.get(robot)
+        if lane is None:
+            return
+        now = asyncio.get_running_loop().time()
+        for limit in lane.motions:
+            if not limit.expired():
+                lane.overtaken.add(limit)
+                limit.reschedule(now)
 
-async def _acquire(lane: _Lane, name: str, command: str, until: float, replaceable: bool) -> None:
+
+async def _acquire(lane: _Lane, name: str, command: str, until: float, replaceable: bool, motion: bool) -> None:
     loop = asyncio.get_running_loop()
     begun = loop.time()
     limit = asyncio.timeout_at(until)
     try:
         async with limit:
+            if motion:
+                lane.motions.add(limit)
             if replaceable:
                 older = lane.replaceable.get(command)
                 lane.replaceable[command] = limit
@@ -83,6 +102,8 @@ async def _acquire(lane: _Lane, name: str, command: str, until: float, replaceab
                     older.reschedule(begun)
             await lane.lock.acquire()
     except TimeoutError:
+        if limit in lane.overtaken:
+            raise CallError("expired", f"a stop came while {name} was at other calls; {command} was not sent") from None
         if limit.when() != until:
             raise CallError("expired", f"a newer {command} came while {name} was at other calls") from None
         if lane.alone is not None:
@@ -92,5 +113,7 @@ async def _acquire(lane: _Lane, name: str, command: str, until: float, replaceab
         waited = f"{max(until - begun, 0):.3g} s"
         raise CallError("expired", f"{name} was at other calls for {waited}; {command} was not sent") from None
     finally:
+        lane.motions.discard(limit)
+        lane.overtaken.discard(limit)
         if lane.replaceable.get(command) is limit:
             del lane.replaceable[command]

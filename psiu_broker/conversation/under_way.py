@@ -58,6 +58,8 @@ class UnderWay:
     frame: Frame | None = None
     sent_at: float = 0.0
     answered: int = 0
+    overtaken: bool = False
+    """A stop came meanwhile: it is not sent again."""
     sending: Sending | None = None
     """The last frame among the others on its link; None where it had to wait."""
     heard: deque[tuple[Reading | CallError, float]] = field(default_factory=deque)
@@ -66,6 +68,11 @@ class UnderWay:
     @property
     def is_stop(self) -> bool:
         return is_stop(self.request.subject)
+
+    @property
+    def is_motion(self) -> bool:
+        """It may move the robot."""
+        return not (self.request.question or self.is_stop or self.is_ending)
 
     @property
     def is_ending(self) -> bool:
