@@ -109,7 +109,10 @@ def test_a_key_that_others_may_read_is_refused_with_what_to_run(keys: Path, owne
     ("left", "expected"),
     [
         (SOON + timedelta(minutes=1), None),
-        (SOON - timedelta(minutes=1), r"ends on 20\d\d-\d\d-\d\d, in 29 days; make another where .*--broker base --renew$"),
+        (
+            SOON - timedelta(minutes=1),
+            r"ends on 20\d\d-\d\d-\d\d, in 29 days; make another where .*--broker base --renew$",
+        ),
         (timedelta(0), r"ended on 20\d\d-\d\d-\d\d: nobody lets its owner in; make another"),
         (timedelta(days=800), r"is valid from 20\d\d-\d\d-\d\d on, and today is 20\d\d-\d\d-\d\d: is it\?"),
     ],

@@ -285,7 +285,7 @@ def warnings_about(
         text = "whoever answers on the local network may move the robots"
         warnings.add(("mesh", "discover"), f"{text}; {_PROTECT_RATHER}")
     if zenoh.tls is not None:
-        for option, text in validity(zenoh.tls, now):
+        for option, text in validity(zenoh.tls, now, serves=True):
             warnings.add(("zenoh", "tls", option), text)
     for trunk in trunks if zenoh.access is not None else ():
         text = "whoever is at its far end counts as a broker, and shows no certificate"
