@@ -26,6 +26,7 @@ from psiu_broker.codecs.identity import identity
 from psiu_broker.codecs.paced import PacedCodec
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config import Configuration, LinkConfiguration
+from psiu_broker.config.policies import policy_of
 from psiu_broker.config.shown import shown
 from psiu_broker.config.who import bindings, ends, own_addresses, rests_of
 from psiu_broker.errors import BusError, CallError
@@ -97,6 +98,7 @@ class Broker:
             [link.name for link in configuration.links.values() if link.options.plays is not None],
         )
         self.exchange = Exchange(Address.named(name), router)
+        router.obey(policy_of(configuration, lambda way: self.exchange.links[way.link].is_named(way.peer)))
         self._qualities = Qualities()
         self.mesh = Mesh(name, self, router, self._ownership, neighbours, self._qualities.of, identity)
         self.exchange.join(self.mesh, MAX_AGE_S)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
@@ -14,7 +14,7 @@ from psiu_broker.config import Configuration
 from psiu_broker.conversation import Conversations, Robot, Traffic
 from psiu_broker.errors import CallCode, CallError
 from psiu_broker.exchange import Exchange
-from psiu_broker.frame import EVERYONE, MESH, Address, Frame
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
 from psiu_broker.messages import Answer, CallRequest, Command
 from psiu_broker.profiles import Description, Profile, PsiuProfile, Request
 from psiu_broker.profiles.psiu import COUNT, QUESTIONS, SHOW, canonical, listed, typed
@@ -55,6 +55,13 @@ _DROPPED: Final[dict[Verdict, tuple[CallCode, str]]] = {
 }
 
 
+class Caller(NamedTuple):
+    """Who wants something of a robot, as the policy knows him, and how he reaches the broker."""
+
+    source: Address
+    way: Way
+
+
 @dataclass(slots=True)
 class _Search:
     """The callers that wait for a robot to be heard."""
@@ -84,10 +91,18 @@ class Calling:
         self.settling_s: Callable[[], float] = lambda: 0.0
         """How long another broker may take to say that it heard a robot, too, that was searched for."""
 
-    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
+    async def call(
+        self,
+        robot: Address,
+        command: str,
+        request: CallRequest,
+        asked_at: float | None = None,
+        by: Caller | None = None,
+    ) -> Answer:
         """Tell `robot` a command and return its answer, within `request.timeout_s` if it is given.
 
-        It is not sent if it was `asked_at` a time longer ago than a frame may wait for the robot's link.
+        It is not sent if it was `asked_at` a time longer ago than a frame may wait for the robot's link, nor where the
+        policy denies it: to `by`, or to the broker itself, as which programs on Zenoh call.
 
         Raises:
             CallError: there is no answer; its code says why.
@@ -101,10 +116,17 @@ class Calling:
         if timeout_s is not None:
             timeout_s -= asyncio.get_running_loop().time() - begun
         fresh_s = inf if asked_at is None else self._fresh_s(route, command, asked_at)
-        return await self.ask(route, command, request.parameters, timeout_s, fresh_s)
+        return await self.ask(route, command, request.parameters, timeout_s, fresh_s, by)
 
-    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
-        """Send a command and go on: what the robot answers is nobody's. `asked_at`: as in `call`; default: now.
+    async def tell(
+        self,
+        robot: Address,
+        command: str,
+        request: CallRequest,
+        asked_at: float | None = None,
+        by: Caller | None = None,
+    ) -> None:
+        """Send a command and go on: what the robot answers is nobody's. `asked_at`, `by`: as in `call`; default: now.
 
         Raises:
             CallError: it cannot be sent; its code says why.
@@ -117,6 +139,7 @@ class Calling:
             return
         if route.way.link == MESH:
             raise _elsewhere(route)
+        self._permit(route, command, request.parameters, by)
         fresh_s = self._fresh_s(route, command, asked_at)
         if request.timeout_s is not None:
             fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
@@ -129,8 +152,9 @@ class Calling:
         parameters: Sequence[Any] = (),
         timeout_s: float | None = None,
         fresh_s: float = inf,
+        by: Caller | None = None,
     ) -> Answer:
-        """Tell the robot of `route` a command, as `Conversations.call` does, and return its answer.
+        """Tell the robot of `route` a command, as `Conversations.call` does, and return its answer; `by` as in `call`.
 
         Raises:
             CallError: there is no answer; its code says why.
@@ -143,6 +167,7 @@ class Calling:
         told = _listing(command, parameters, route, self.commands(route))
         if told is not None and route.protocol != psiu_ascii.PROTOCOL:
             return told
+        self._permit(route, command, parameters, by)
         options = link.configuration.options
         try:
             return await self.conversations.call(
@@ -245,6 +270,28 @@ class Calling:
         return Traffic(found.frames_out, max(found.last_sent, last_heard), found.frames_in)
 
     # Inside.
+
+    def _permit(self, route: Route, command: str, parameters: Sequence[Any], by: Caller | None) -> None:
+        """Raise CallError where the policy keeps the command from the robot, by whichever of its names it is called."""
+        policy = self._router.policy
+        if policy is None:
+            return
+        robot = self._robot(route)
+        try:
+            request = robot.profile.request(command, parameters)
+        except CallError:
+            return  # which says why better
+        if request.question:
+            return
+        words = {command, request.subject, *policy.words(robot.build(request))}
+        for each in robot.profile.commands():
+            names = {each.name, *each.aliases}
+            if not names.isdisjoint(words):
+                words |= names
+        source, way = by or Caller(self.name, SELF)
+        rule = policy.denial_of(source, route.robot, words, way)
+        if rule is not None:
+            raise CallError("refused", f"{source} may not tell {route.robot} {command}: {rule}")
 
     def _fresh_s(self, route: Route, command: str, asked_at: float) -> float:
         """How long `command`, asked for then, may still wait before it is too late for the robot."""

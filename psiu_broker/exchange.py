@@ -19,7 +19,7 @@ from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.routing.allowance import Allowance
 from psiu_broker.routing.holding import Holding
 from psiu_broker.routing.outbox import Fate, is_question
-from psiu_broker.routing.router import ANY, DOUBLE, IMPOSSIBLE_SOURCE, SELF, Decision, Port, Router
+from psiu_broker.routing.router import ANY, SELF, Decision, Port, Router
 from psiu_broker.routing.verdicts import (
     ANSWERED,
     DELIVERED,
@@ -151,7 +151,12 @@ class Exchange:
         self.allowances[link.name] = Allowance(link.adapter.bits_per_second)
         options = link.configuration.options
         self._ports[link.name] = Port(
-            link.name, link.configuration.protocol, link.ways, options.wildcard, _domain(link.configuration.codec)
+            link.name,
+            link.configuration.protocol,
+            link.ways,
+            options.wildcard,
+            _domain(link.configuration.codec),
+            options.new_names_per_minute,
         )
         self._route_age_s[link.name] = options.route_age_s
         self._max_age_s[link.name] = options.max_age_s, options.question_max_age_s
@@ -180,7 +185,7 @@ class Exchange:
                 self._publish(frame, decision.hops, way)
         else:
             # Before it is carried out: listeners hear a question before our answer to it.
-            if bus.listened and decision is not DOUBLE and decision is not IMPOSSIBLE_SOURCE:
+            if bus.listened and not decision.void:
                 self._publish(frame, decision.hops, way)
             verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
@@ -197,7 +202,7 @@ class Exchange:
         account = self.accounts[MESH]
         account.arrived += 1
         decision = self.router.route(frame, way, now)
-        if self.bus.listened and decision is not DOUBLE and self.router.is_here(frame.source):
+        if self.bus.listened and not decision.void and self.router.is_here(frame.source):
             self._publish(frame, decision.hops, way)
         patience_s = self._longest_wait_s(frame, decision.hops) - age_s
         verdict: Verdict | None

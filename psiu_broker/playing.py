@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
+from psiu_broker.calling import Caller
 from psiu_broker.config import Configuration
 from psiu_broker.config.who import Ends, ends
 from psiu_broker.errors import CallError
@@ -38,10 +39,14 @@ log = logging.getLogger(__name__)
 class Robots(Protocol):
     """What programs are offered of robots."""
 
-    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
+    async def call(
+        self, robot: Address, command: str, request: CallRequest, asked_at: float | None, by: Caller
+    ) -> Answer:
         """As `Calling.call`."""
 
-    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
+    async def tell(
+        self, robot: Address, command: str, request: CallRequest, asked_at: float | None, by: Caller
+    ) -> None:
         """As `Calling.tell`."""
 
 
@@ -121,6 +126,7 @@ class Playing:
             played.own,
             played.far(way.peer),
             configuration.protocol,
+            way,
             lambda frame: self._exchange.send_by(frame, way, self._clock()),
             self._robots,
             self._clock,
@@ -149,6 +155,7 @@ class Program:
         robot: Address,
         address: Address,
         protocol: str,
+        way: Way,
         send: Callable[[Frame], object],
         robots: Robots,
         clock: Callable[[], float],
@@ -159,6 +166,7 @@ class Program:
         self._persona = persona
         self._address = address
         self._protocol = protocol
+        self._caller = Caller(address, way)
         self._send = send
         self._robots = robots
         self._clock = clock
@@ -272,9 +280,9 @@ class Program:
         try:
             request = CallRequest(parameters=list(call.parameters))
             if waits:
-                answer = await self._robots.call(self.robot, call.command, request, asked.at)
+                answer = await self._robots.call(self.robot, call.command, request, asked.at, self._caller)
             else:
-                await self._robots.tell(self.robot, call.command, request, asked.at)
+                await self._robots.tell(self.robot, call.command, request, asked.at, self._caller)
         except (CallError, ValueError) as failure:
             error = str(failure)
             log.debug("%s told %s %s: %s", self._address, self.robot, call.command, error)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from psiu_broker.calling import DISCOVER, Calling
+from psiu_broker.calling import DISCOVER, Caller, Calling
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.psiu_hexa import BAD_CHECK, PsiuHexa
 from psiu_broker.config import Configuration
@@ -105,7 +105,7 @@ class Resident:
         if told is not None:
             self._exchange.send(told, now)
         elif not said(frame).answer:
-            self._start(self._ask_for(frame, route, now))
+            self._start(self._ask_for(frame, route, way, now))
         return LINK_DOWN if down else ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
@@ -264,13 +264,14 @@ class Resident:
         except CallError as error:
             log.info("greeting %s: %s", route.robot, error)
 
-    async def _ask_for(self, frame: Frame, route: Route, arrived: float) -> None:
+    async def _ask_for(self, frame: Frame, route: Route, way: Way, arrived: float) -> None:
         """Do for the sender of `frame`, in words, what a robot of bytes is told; answer in the robot's name."""
         word, *words = frame.payload.decode("ascii", "replace").split() or [frame.subject]
         name = str(route.robot)
         longest_s = self._exchange.links[route.way.link].configuration.options.longest_wait_s(word)
+        fresh_s = longest_s - (self._clock() - arrived)
         try:
-            answer = await self._calling.ask(route, word, words, fresh_s=longest_s - (self._clock() - arrived))
+            answer = await self._calling.ask(route, word, words, fresh_s=fresh_s, by=Caller(frame.source, way))
         except CallError as error:
             log.debug("%s told %s %s: %s", frame.source, name, word, error)
             told = self._responder.refused(frame, name, self._clock())

@@ -369,9 +369,9 @@ def test_an_answer_goes_to_who_was_heard_by_the_robot_not_to_who_only_tried() ->
 def test_who_passes_for_the_broker_is_not_published(world: World) -> None:
     bus = world.exchange.bus = Bus()
     world.links["radio"].received(wire("base", "MNERIM", "parafrente", "9"), None)
-    assert world.verdicts("radio") == {"refused": 1}
+    assert world.verdicts("radio") == {"spoofed": 1}
     assert bus.frames == []
-    assert [raw.verdict for raw in bus.raw] == ["refused"]
+    assert [raw.verdict for raw in bus.raw] == ["spoofed"]
 
 
 def test_the_brokers_own_frames_are_published_with_the_bytes_that_left(world: World) -> None:
@@ -415,7 +415,7 @@ def test_what_the_broker_sent_and_hears_again_does_not_go_round(world: World) ->
     assert world.verdicts("second") == {"duplicate": 1}
     world.now += 5
     world.links["second"].received(wire("base", "MNERIM", "parafrente", "1"), None)
-    assert world.verdicts("second") == {"duplicate": 1, "refused": 1}
+    assert world.verdicts("second") == {"duplicate": 1, "spoofed": 1}
 
 
 def test_bytes_travel_between_links_of_different_topologies_and_back_to_the_asker() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
 
+from psiu_broker.calling import Caller
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.identity import identity
@@ -294,18 +295,22 @@ class Silent:
         self.called: list[str] = []
         self.was_told: list[str] = []
 
-    async def call(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> Answer:
+    async def call(
+        self, robot: Address, command: str, request: CallRequest, asked_at: float | None, by: Caller
+    ) -> Answer:
         self.called.append(command)
         await asyncio.Event().wait()
         raise AssertionError
 
-    async def tell(self, robot: Address, command: str, request: CallRequest, asked_at: float | None = None) -> None:
+    async def tell(
+        self, robot: Address, command: str, request: CallRequest, asked_at: float | None, by: Caller
+    ) -> None:
         self.was_told.append(command)
 
 
 def program(robots: Silent) -> tuple[Program, Listener]:
     listener = Listener()
-    return Program(listener, MNERIM, NOBODY, "mitya", lambda frame: None, robots, lambda: 0.0), listener
+    return Program(listener, MNERIM, NOBODY, "mitya", Way("painel"), lambda frame: None, robots, lambda: 0.0), listener
 
 
 def hears(made: Program, command: str) -> bool:

@@ -1,20 +1,35 @@
 """Where a frame goes.
 
-`Router.route` is asked once for each frame that arrived. In order: a double is dropped; the source
-is learned; then the destination decides. A known robot has its decision ready on its route, so the
+`Router.route` is asked once for each frame that arrived. In order: a source that cannot be there and a
+command that the policy denies are dropped, and so is a double; the source is learned; then the
+destination decides. A known robot has its decision ready on its route, so the
 usual frame costs three look-ups, however many robots there are; every other case is `decide`,
 which changes nothing and which `why` asks too.
 """
 
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
 from psiu_broker.frame import EVERYONE, MESH, NOBODY, Address, Frame, Way
 from psiu_broker.routing.duplicates import Duplicates
+from psiu_broker.routing.guard import Guard
+from psiu_broker.routing.outbox import is_stop
 from psiu_broker.routing.ownership import Ownership
+from psiu_broker.routing.policy import Policy, Rule
 from psiu_broker.routing.table import Binding, Route, Table
-from psiu_broker.routing.verdicts import DUPLICATE, LINK_DOWN, NO_ROUTE, REFUSED, SAME_WAY, Verdict
+from psiu_broker.routing.verdicts import (
+    DENIED,
+    DUPLICATE,
+    LINK_DOWN,
+    NO_ROUTE,
+    REFUSED,
+    SAME_WAY,
+    SPOOFED,
+    STORM,
+    TOO_MANY_NAMES,
+    Verdict,
+)
 
 SELF: Final = Way("@self")
 """The way of frames that the broker itself sends or answers."""
@@ -35,6 +50,8 @@ class Decision:
     action: Action
     hops: tuple[Way, ...] = ()
     verdict: Verdict | None = None
+    void: bool = False
+    """The frame is as if it had not been heard: nobody is told what it says."""
     only: Way | None = field(init=False, repr=False, compare=False)
     """The hop of a forward that has just one, as nearly every frame's has."""
 
@@ -43,8 +60,11 @@ class Decision:
         object.__setattr__(self, "only", self.hops[0] if single else None)
 
 
-DOUBLE: Final = Decision("drop", verdict=DUPLICATE)
-IMPOSSIBLE_SOURCE: Final = Decision("drop", verdict=REFUSED)
+DOUBLE: Final = Decision("drop", verdict=DUPLICATE, void=True)
+_TURNED_AWAY: Final[Mapping[Verdict, Decision]] = {
+    verdict: Decision("drop", verdict=verdict, void=True)
+    for verdict in (REFUSED, DENIED, SPOOFED, TOO_MANY_NAMES, STORM)
+}
 _ANSWER: Final = Decision("answer")
 
 
@@ -63,6 +83,8 @@ class Port(NamedTuple):
     """Whether questions to everyone go out on it."""
     domain: str | None = None
     """Whose PSIU HEXA numbers can be asked for on it; None: nobody's."""
+    new_names_per_minute: int | None = None
+    """How many robots may be heard there for the first time; None: as many as there are."""
 
 
 class Router:
@@ -89,36 +111,61 @@ class Router:
         ownership: Ownership | None = None,
         plays: Collection[str] = (),
     ) -> None:
-        self.table = Table(bindings, withdrawn)
+        self.table = Table(bindings, self._gone)
         self._routes = self.table.routes
         for address, protocol in own.items():
             route = Route((address,), SELF, protocol, pinned=True)
             route.decision = _ANSWER
             self._routes[address] = route
+        self.guard = Guard()
+        self.policy: Policy | None = None
         self.ports: dict[str, Port] = {}
         """The links that are up, and `MESH`."""
         self._ownership = ownership
         self._plays = frozenset(plays)
         self._identity = identity
         self._heard = heard
+        self._withdrawn = withdrawn
         self._duplicates = duplicates or Duplicates()
+
+    def obey(self, policy: Policy) -> None:
+        """From now on `policy` says who may command whom.
+
+        What the broker sends itself, and what programs want of the robot that they are played, is judged elsewhere:
+        where it is a call.
+        """
+        policy.addresses_of = self._addresses_of
+        self.policy = None if policy.idle else policy
 
     def route(self, frame: Frame, arrived: Way, now: float) -> Decision:
         """Decide for a frame that arrived, and learn from it."""
-        if self._duplicates.is_double(self._identity(frame), arrived, now, frame.subject):
-            return self._note_double(frame, arrived, now)
         routes = self._routes
         source = routes.get(frame.source)
-        if source is not None and source.way is arrived:
+        is_there = source is not None and source.way is arrived
+        # Before its double is looked for: what is turned away must not stand in the way of what it imitates.
+        if not is_there and self._is_spoofed(source, arrived):
+            return self._refuse_spoofed(frame, arrived, now)
+        policy = self.policy
+        if policy is not None and arrived is not SELF:
+            rule = policy.denial(frame, arrived)
+            if rule is not None and not self._is_played(frame, arrived):
+                return self._turn_away(frame, DENIED, arrived, now, rule)
+        if self._duplicates.is_double(self._identity(frame), arrived, now, frame.subject):
+            return self._note_double(frame, arrived, now)
+        if source is not None and is_there:
             source.heard_at = now
             source.frames += 1
-        elif not self._learn(frame, source, arrived, now):
-            return IMPOSSIBLE_SOURCE
+        else:
+            wrong = self._learn(frame, source, arrived, now)
+            if wrong is not None:
+                return self._turn_away(frame, wrong, arrived, now)
         target = routes.get(frame.destination)
         if target is not None and target.protocol == frame.protocol and target.way != arrived:
             ready: Decision | None = target.decision
             if ready is not None:
                 return ready
+        elif target is None and self._is_storm(frame, arrived, now):
+            return self._turn_away(frame, STORM, arrived, now)
         return self.decide(frame.destination, frame.protocol, arrived)
 
     def sent(self, frame: Frame, now: float) -> None:
@@ -156,6 +203,8 @@ class Router:
 
     def link_up(self, port: Port) -> None:
         self.ports[port.link] = port
+        if port.new_names_per_minute is not None:
+            self.guard.limit(port.link, port.new_names_per_minute)
         for route in self.table:
             if route.way.link == port.link:
                 self._refresh(route)
@@ -207,6 +256,8 @@ class Router:
         route = self.table.place(addresses, way, protocol, now, heard=heard)
         if route is not None:
             self._refresh(route)
+            if route is not before and self.policy is not None:
+                self.policy.forget()
             if route is not before or way_before != way:
                 self._heard(route)
 
@@ -231,23 +282,67 @@ class Router:
         self._heard(route)
         return True
 
-    def _learn(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> bool:
-        """Take note of the sender; False if it cannot be who it says."""
-        if arrived == SELF or frame.source == NOBODY:
-            return True
-        if frame.source == EVERYONE or (source is not None and source.way == SELF):
+    def _gone(self, route: Route) -> None:
+        if len(route.addresses) > 1 and self.policy is not None:
+            self.policy.forget()
+        self._withdrawn(route)
+
+    def _addresses_of(self, address: Address) -> tuple[Address, ...]:
+        route = self._routes.get(address)
+        return (address,) if route is None else route.addresses
+
+    def _is_spoofed(self, source: Route | None, arrived: Way) -> bool:
+        """Whether `source`, by the configuration, is elsewhere; what robots another broker hears, that broker knows."""
+        if source is None or arrived is SELF:
             return False
+        return source.way is SELF or (arrived.link != MESH and not source.may_be_on(arrived))
+
+    def _refuse_spoofed(self, frame: Frame, arrived: Way, now: float) -> Decision:
+        if self._duplicates.knows(self._identity(frame), arrived, now, frame.subject):
+            return DOUBLE  # overheard, or come round
+        return self._turn_away(frame, SPOOFED, arrived, now)
+
+    def _turn_away(
+        self, frame: Frame, verdict: Verdict, arrived: Way, now: float, rule: Rule | None = None
+    ) -> Decision:
+        self.guard.refused(frame, verdict, arrived, now, rule)
+        return _TURNED_AWAY[verdict]
+
+    def _is_played(self, frame: Frame, arrived: Way) -> bool:
+        """Whether a program says to a robot that it is played what becomes a call, and is judged then."""
+        target = self._routes.get(frame.destination) if arrived.link in self._plays else None
+        return target is not None and target.protocol != frame.protocol
+
+    def _is_storm(self, frame: Frame, arrived: Way, now: float) -> bool:
+        """Whether `frame` is one too many to everyone; a stop never is."""
+        if frame.destination != EVERYONE or arrived is SELF or arrived.link == MESH or is_stop(frame.subject):
+            return False
+        return not self.guard.may_tell_everyone(arrived.link, now)
+
+    def _learn(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> Verdict | None:
+        """Take note of the sender; the verdict if it cannot be who it says, or is one too many."""
+        if arrived == SELF or frame.source == NOBODY:
+            return None
+        if frame.source == EVERYONE:
+            return REFUSED
         if arrived.link == MESH:
-            return True  # other brokers announce their robots; what these say teaches nothing
+            return None  # other brokers announce their robots; what these say teaches nothing
         if source is not None and source.way.link == MESH and not self._takes(source, frame, arrived, now):
-            return True
+            return None
+        if source is None and not self._may_come(frame.source, arrived, now):
+            return TOO_MANY_NAMES
         news = source is None or source.way != arrived or source.heard_at is None
         route = self.table.learn(frame.source, arrived, frame.protocol, now)
         if route is not None:
             self._refresh(route)
             if news:
                 self._heard(route)
-        return True
+        return None
+
+    def _may_come(self, robot: Address, arrived: Way, now: float) -> bool:
+        """Whether `robot` may be known from now on; one that was there before its link went down is no news."""
+        departed = self.table.departed(robot)
+        return (departed is not None and departed.link == arrived.link) or self.guard.may_name(arrived.link, now)
 
     def _takes(self, source: Route, frame: Frame, arrived: Way, now: float) -> bool:
         """Whether a robot of another broker, heard here, is ours from now on."""
