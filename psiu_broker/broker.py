@@ -38,7 +38,7 @@ from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
 from psiu_broker.mesh.neighbour import Neighbours
 from psiu_broker.mesh.probe import Probed
 from psiu_broker.mesh.quality import Qualities
-from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, Route, Status, Trace, Why
+from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, RobotAccount, Route, Status, Trace, Why
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
@@ -193,6 +193,7 @@ class Broker:
             listen=list(self.configuration.zenoh.listen),
             published=bus.publisher.puts if bus else 0,
             unpublished=bus.publisher.failures if bus else 0,
+            tasks=len(asyncio.all_tasks()),
             refused_puts=bus.calls.refused_puts if bus else 0,
         )
 
@@ -207,6 +208,9 @@ class Broker:
 
     def ledger(self) -> Ledger:
         return self.report.ledger()
+
+    def robot_accounts(self) -> Sequence[RobotAccount]:
+        return self.report.robot_accounts()
 
     def health(self) -> Health:
         checks = self._checks()

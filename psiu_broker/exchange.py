@@ -2,7 +2,8 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Set
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import suppress
 from datetime import UTC, datetime
 from math import inf
@@ -112,7 +113,7 @@ class Outlet(Protocol):
 class Exchange:
     """Moves frames between links and other brokers; implements `link.Hub`.
 
-    For each link, and for the broker's own frames under `SELF`, at every moment:
+    For each link, for the broker's own frames under `SELF`, and in `Router.books` for each robot, at every moment:
     arrived = settled (delivered, answered, dropped) + waiting.
     """
 
@@ -131,6 +132,7 @@ class Exchange:
         self.allowances: dict[str, Allowance] = {}
         """For what the broker asks on each link without having been told to."""
         self.router = router
+        router.books.waiting = lambda: Counter(frame.source for frame, _ in self._waiting())
         self.holding = holding or Holding()
         self.alone: Set[Address] = frozenset()
         """Robots that must hear nothing but the broker's own calls now."""
@@ -190,6 +192,8 @@ class Exchange:
             verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
             account.fates[verdict] += 1
+            if verdict is not DELIVERED:
+                self.router.books.settled(frame.source, verdict)
             if bus.raw_listened:
                 self._tap("in", way, verdict, frame)
         return verdict
@@ -213,7 +217,7 @@ class Exchange:
         else:
             verdict = self._carry_out(decision, frame, way, now, patience_s)
         if verdict is not None:
-            account.fates[verdict] += 1
+            self._settle(account, frame, verdict)
             if self.bus.raw_listened:
                 self._tap("in", way, verdict, frame)
         return verdict
@@ -223,11 +227,13 @@ class Exchange:
         account = self.accounts[MESH]
         account.arrived += 1
         account.fates[verdict] += 1
+        self.router.books.nameless(verdict)
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
         account = self.accounts[way.link]
         account.arrived += 1
         account.fates[MALFORMED] += 1
+        self.router.books.nameless(MALFORMED)
         if self.bus.raw_listened:
             self._tap("in", way, MALFORMED, malformed)
         self.resident.malformed(malformed, way, now)
@@ -251,7 +257,7 @@ class Exchange:
             self._publish(frame, (way,), SELF)
         verdict = self._spread(frame, (way,), SELF, now)
         if verdict is not None:
-            account.fates[verdict] += 1
+            self._settle(account, frame, verdict)
         return verdict
 
     def ask_names(self, link: Link, now: float, *, told: bool = False) -> None:
@@ -275,7 +281,7 @@ class Exchange:
             self.resident.delivered(fate.frame, now)
         final = fate.settle(verdict)
         if final is not None:
-            self.accounts[fate.arrived.link].fates[final] += 1
+            self._settle(self.accounts[fate.arrived.link], fate.frame, final)
             if self.bus.raw_listened:
                 self._tap("in", fate.arrived, final, fate.frame)
             if final is not DELIVERED and fate.arrived is SELF:
@@ -325,11 +331,22 @@ class Exchange:
 
     def waiting(self) -> dict[str, int]:
         """How many of the frames that arrived on each link wait now, in an outbox or for a route."""
-        fates = {id(parcel.fate): parcel.fate for link in self.links.values() for parcel in link.outbox}
-        counts = {name: self.holding.waiting_from(name) for name in self.accounts}
-        for fate in fates.values():
-            counts[fate.arrived.link] += 1
+        counts = dict.fromkeys(self.accounts, 0)
+        for _, arrived in self._waiting():
+            counts[arrived.link] += 1
         return counts
+
+    def _waiting(self) -> Iterator[tuple[Frame, Way]]:
+        fates = {id(parcel.fate): parcel.fate for link in self.links.values() for parcel in link.outbox}
+        for fate in fates.values():
+            yield fate.frame, fate.arrived
+        for held in self.holding:
+            yield held.frame, held.arrived
+
+    def _settle(self, account: Account, frame: Frame, verdict: Verdict) -> None:
+        account.fates[verdict] += 1
+        if verdict is not DELIVERED:
+            self.router.books.settled(frame.source, verdict)
 
     def _tap(self, direction: Literal["in", "out"], way: Way, verdict: Verdict, what: Frame | Malformed) -> None:
         if not self.bus.tapped(way.link):
@@ -464,7 +481,7 @@ class Exchange:
                 self._publish(frame, tuple(asked), SELF)
             verdict = self._spread(frame, tuple(asked), SELF, now)
             if verdict is not None:
-                account.fates[verdict] += 1
+                self._settle(account, frame, verdict)
 
     def _question(self, robot: Address, link: str) -> Frame:
         """What makes `robot` speak: a name is asked for, a number is pinged, which moves nobody."""

@@ -201,7 +201,21 @@ class Ledger(Message):
 
     accounts: list[Account]
     total: Account
-    balances: bool
+    balances: bool = Field(description="every account, and the sum over all robots is the sum over all links")
+
+
+class RobotAccount(Message):
+    """What became of the frames that name one robot as their sender: ``psiu/@broker/{broker}/ledger-of-robots``."""
+
+    robot: str | None = Field(
+        default=None, description="null: what names nobody, and robots not heard of for so long that they are forgotten"
+    )
+    link: str | None = Field(default=None, description="where it is; @mesh: at another broker; null: nobody knows")
+    arrived: int
+    delivered: int
+    answered: int
+    dropped: dict[str, int] = Field(default={}, description="frames by reason")
+    waiting: int = 0
 
 
 class Status(Message):
@@ -218,6 +232,7 @@ class Status(Message):
     listen: list[str]
     published: int = Field(default=0, description="messages put on the bus since it was opened")
     unpublished: int = Field(default=0, description="messages that could not be put")
+    tasks: int = Field(default=0, description="what the broker does at the same time, as asyncio counts it")
     refused_puts: int = Field(default=0, description="commands put without waiting and refused: nobody was told")
 
 
@@ -342,6 +357,7 @@ PUBLISHED: Final[tuple[type[Message], ...]] = (
     Trunk,
     Route,
     Ledger,
+    RobotAccount,
     Status,
     Health,
     Why,

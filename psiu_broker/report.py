@@ -10,11 +10,23 @@ from psiu_broker.exchange import Exchange
 from psiu_broker.frame import EVERYONE, MESH, Address, Way, peer_text
 from psiu_broker.link import Link
 from psiu_broker.mesh.mesh import Mesh
-from psiu_broker.messages import Account, Card, Command, Conflict, Ledger, MeshBroker, MeshRobot, Route, Why
+from psiu_broker.messages import (
+    Account,
+    Card,
+    Command,
+    Conflict,
+    Ledger,
+    MeshBroker,
+    MeshRobot,
+    RobotAccount,
+    Route,
+    Why,
+)
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.routing import table, verdicts
+from psiu_broker.routing.books import Told
 from psiu_broker.routing.claims import BEST
 from psiu_broker.routing.router import SELF, Decision
 from psiu_broker.trunk import Trunk
@@ -175,7 +187,22 @@ class Report:
             for verdict, count in account.fates.items():
                 whole.fates[verdict] += count
         total = _account("total", whole, sum(waiting.values()))
-        return Ledger(accounts=accounts, total=total, balances=all(map(_balances, accounts)))
+        balances = all(map(_balances, accounts)) and _agree(total, list(self._router.books.told()))
+        return Ledger(accounts=accounts, total=total, balances=balances)
+
+    def robot_accounts(self) -> list[RobotAccount]:
+        return [
+            RobotAccount(
+                robot=None if told.robot is None else str(told.robot),
+                link=told.link,
+                arrived=told.arrived,
+                delivered=told.delivered,
+                answered=told.answered,
+                dropped={str(verdict): count for verdict, count in told.dropped.items()},
+                waiting=told.waiting,
+            )
+            for told in self._router.books.told()
+        ]
 
     def why(self, source: Address, destination: Address) -> Why:
         """What would become of a frame from `source` to `destination` now, step by step; nothing is sent."""
@@ -328,6 +355,19 @@ def _account(name: str, account: verdicts.Account, waiting: int) -> Account:
         answered=account.fates[verdicts.ANSWERED],
         dropped=dropped,
         waiting=waiting,
+    )
+
+
+def _agree(total: Account, robots: Sequence[Told]) -> bool:
+    """Whether the robots' books, which are kept apart from the links', add up to `total`."""
+    dropped: Counter[str] = Counter()
+    for robot in robots:
+        dropped.update({str(verdict): count for verdict, count in robot.dropped.items()})
+    sums = [sum(getattr(each, what) for each in robots) for what in ("arrived", "delivered", "answered", "waiting")]
+    return (
+        sums == [total.arrived, total.delivered, total.answered, total.waiting]
+        and dropped == total.dropped
+        and all(robot.delivered >= 0 for robot in robots)
     )
 
 

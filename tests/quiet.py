@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from psiu_broker.bus.queries import Source
 from psiu_broker.frame import Address
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Mesh, Route, Status, Trunk, Why
+from psiu_broker.messages import Account, Card, Health, Ledger, Link, Mesh, RobotAccount, Route, Status, Trunk, Why
 
 NOW: Final = datetime(2026, 11, 22, tzinfo=UTC)
 
@@ -38,6 +38,9 @@ class Quiet(Source):
 
     def ledger(self) -> Ledger:
         return Ledger(accounts=[], total=Account(link="", arrived=0, delivered=0, answered=0), balances=True)
+
+    def robot_accounts(self) -> Sequence[RobotAccount]:
+        return []
 
     def health(self) -> Health:
         return Health(healthy=True, checks={})

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 
 import pytest
+from balanced import assert_balanced
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -132,9 +133,7 @@ class World:
         return {verdict: count for verdict, count in self.exchange.accounts[link].fates.items() if count}
 
     def balances(self) -> None:
-        waiting = self.exchange.waiting()
-        for name, account in self.exchange.accounts.items():
-            assert account.arrived == account.settled() + waiting[name], name
+        assert_balanced(self.exchange)
 
 
 def wire(source: str, destination: str, *words: str) -> bytes:

@@ -12,7 +12,7 @@ from psiu_broker.bus.replies import Replies, Values
 from psiu_broker.bus.session import JSON, Session, json_of
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Card, Health, Ledger, Link, Mesh, Route, Status, Trunk, Why
+from psiu_broker.messages import Card, Health, Ledger, Link, Mesh, RobotAccount, Route, Status, Trunk, Why
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +33,7 @@ class Source(Protocol):
     def trunks(self) -> Sequence[Trunk]: ...
     def routes(self) -> Sequence[Route]: ...
     def ledger(self) -> Ledger: ...
+    def robot_accounts(self) -> Sequence[RobotAccount]: ...
     def health(self) -> Health: ...
     def mesh_seen(self) -> Mesh: ...
     def config(self) -> Mapping[str, Any]: ...
@@ -61,6 +62,7 @@ class Queries:
             keys.broker(broker, "trunks"): (json_of("Trunk[]"), source.trunks),
             keys.broker(broker, "routes"): (json_of("Route[]"), source.routes),
             keys.broker(broker, "ledger"): (json_of("Ledger"), source.ledger),
+            keys.broker(broker, "ledger-of-robots"): (json_of("RobotAccount[]"), source.robot_accounts),
             keys.broker(broker, "health"): (json_of("Health"), source.health),
             keys.broker(broker, "mesh"): (json_of("Mesh"), source.mesh_seen),
             keys.broker(broker, "config"): (JSON, source.config),

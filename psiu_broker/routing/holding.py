@@ -1,5 +1,6 @@
 """Frames for a robot that nobody has heard yet: kept for a moment while it is asked for by name."""
 
+from collections.abc import Iterator
 from math import inf
 from typing import NamedTuple
 
@@ -28,9 +29,8 @@ class Holding:
         """When each destination that is waited for was asked for."""
         self._size = 0
 
-    def waiting_from(self, link: str) -> int:
-        """How many of the held frames arrived on `link`."""
-        return sum(held.arrived.link == link for frames in self._held.values() for held in frames)
+    def __iter__(self) -> Iterator[Held]:
+        return (held for frames in self._held.values() for held in frames)
 
     def is_due(self, destination: Address, now: float) -> bool:
         """Whether to ask for `destination`: not while an answer may be on its way, but again if that stays out."""

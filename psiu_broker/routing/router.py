@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
 from psiu_broker.frame import EVERYONE, MESH, NOBODY, Address, Frame, Way
+from psiu_broker.routing.books import Books
 from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.guard import Guard
 from psiu_broker.routing.outbox import is_stop
@@ -113,6 +114,7 @@ class Router:
     ) -> None:
         self.table = Table(bindings, self._gone)
         self._routes = self.table.routes
+        self.books = Books(self._routes)
         for address, protocol in own.items():
             route = Route((address,), SELF, protocol, pinned=True)
             route.decision = _ANSWER
@@ -149,13 +151,16 @@ class Router:
         if policy is not None and arrived is not SELF:
             rule = policy.denial(frame, arrived)
             if rule is not None and not self._is_played(frame, arrived):
+                self.books.arrived(frame.source)
                 return self._turn_away(frame, DENIED, arrived, now, rule)
         if self._duplicates.is_double(self._identity(frame), arrived, now, frame.subject):
+            self.books.arrived(frame.source)
             return self._note_double(frame, arrived, now)
         if source is not None and is_there:
             source.heard_at = now
             source.frames += 1
         else:
+            self.books.arrived(frame.source)
             wrong = self._learn(frame, source, arrived, now)
             if wrong is not None:
                 return self._turn_away(frame, wrong, arrived, now)
@@ -169,7 +174,8 @@ class Router:
         return self.decide(frame.destination, frame.protocol, arrived)
 
     def sent(self, frame: Frame, now: float) -> None:
-        """A frame of our own left without being routed: what comes round of it is a double."""
+        """A frame of our own leaves without being routed: what comes round of it is a double."""
+        self.books.arrived(frame.source)
         self._duplicates.is_double(self._identity(frame), SELF, now, frame.subject)
 
     def decide(self, destination: Address, protocol: str, arrived: Way) -> Decision:
@@ -285,6 +291,7 @@ class Router:
     def _gone(self, route: Route) -> None:
         if len(route.addresses) > 1 and self.policy is not None:
             self.policy.forget()
+        self.books.departed(route)
         self._withdrawn(route)
 
     def _addresses_of(self, address: Address) -> tuple[Address, ...]:
@@ -298,6 +305,7 @@ class Router:
         return source.way is SELF or (arrived.link != MESH and not source.may_be_on(arrived))
 
     def _refuse_spoofed(self, frame: Frame, arrived: Way, now: float) -> Decision:
+        self.books.arrived(frame.source)
         if self._duplicates.knows(self._identity(frame), arrived, now, frame.subject):
             return DOUBLE  # overheard, or come round
         return self._turn_away(frame, SPOOFED, arrived, now)

@@ -22,7 +22,18 @@ class Binding(NamedTuple):
 class Route:
     """The way to one robot. Mutable: the router touches it for each frame that the robot sends."""
 
-    __slots__ = ("addresses", "decision", "first_heard", "frames", "heard_at", "home", "pinned", "protocol", "way")
+    __slots__ = (
+        "addresses",
+        "decision",
+        "first_heard",
+        "frames",
+        "heard_at",
+        "home",
+        "learned",
+        "pinned",
+        "protocol",
+        "way",
+    )
 
     def __init__(self, addresses: tuple[Address, ...], way: Way, protocol: str, *, pinned: bool) -> None:
         self.addresses = addresses
@@ -37,6 +48,13 @@ class Route:
         self.first_heard: float | None = None
         self.heard_at: float | None = None
         self.frames = 0
+        self.learned = 0
+        """How many of `frames` taught something new: these are not `counted`."""
+
+    @property
+    def counted(self) -> int:
+        """The frames that came by the known way, which only this route counts."""
+        return self.frames - self.learned
 
     @property
     def robot(self) -> Address:
@@ -96,6 +114,7 @@ class Table:
         route.protocol = protocol
         route.heard_at = now
         route.frames += 1
+        route.learned += 1
         if route.first_heard is None:
             route.first_heard = now
         return route

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import combinations, count
 from typing import Final, NamedTuple
 
+from balanced import assert_balanced
 from memory_adapter import MemoryAdapter, MemoryTransport, codec_of, configuration
 
 from psiu_broker.codecs import psiu_ascii
@@ -459,9 +460,7 @@ class Simulation:
     def balances(self) -> None:
         """Every frame is accounted for, in the books of each broker and between each two of them."""
         for station in (*self.stations.values(), *self.former):
-            waiting = station.exchange.waiting()
-            for link, account in station.exchange.accounts.items():
-                assert account.arrived == account.settled() + waiting[link], (station.name, link)
+            assert_balanced(station.exchange)
         for one in self.stations.values():
             for other in one.neighbours:
                 there = self.stations[other.name].neighbours.find(one.name)
