@@ -78,10 +78,8 @@ def unpack(data: bytes) -> Envelope | None:
         protocol, source_name, source_domain, name, domain, subject = texts
     except ValueError:
         return None
-    if len(data) < start or not (_is_address(source_name, source) and _is_address(name, destination)):
-        return None
     sender, receiver = Address(source_name, source, source_domain), Address(name, destination, domain)
-    if protocol not in PROTOCOLS:
+    if len(data) < start or not (_can_be(sender) and _can_be(receiver)) or protocol not in PROTOCOLS:
         return None
     make = _MAKERS.get(protocol)
     frame = Frame(sender, receiver, subject, data[start:], protocol) if make is None else None
@@ -90,9 +88,11 @@ def unpack(data: bytes) -> Envelope | None:
     return None if frame is None else Envelope(epoch, to_epoch, sequence, sent_us, age_ms, frame)
 
 
-def _is_address(name: str, number: int) -> bool:
-    """A name or a number, not both; neither is the source of a protocol that names none."""
-    return number == -1 if name else -1 <= number <= 255
+def _can_be(address: Address) -> bool:
+    """A name, or a number within a domain; neither is the source of a protocol that names none."""
+    if address.name or address.number == -1:
+        return address.number == -1 and not address.domain
+    return 0 <= address.number <= 255
 
 
 def _ascii(source: Address, destination: Address, payload: bytes) -> Frame | None:

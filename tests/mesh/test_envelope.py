@@ -94,6 +94,9 @@ def test_what_is_too_long_is_refused() -> None:
     [
         MESSAGE._replace(protocol="smoke-signals"),
         MESSAGE._replace(source=Address("PC", 5)),
+        MESSAGE._replace(source=Address("PC", domain="red")),
+        MESSAGE._replace(destination=Address("MNERIM", domain="red")),
+        MESSAGE._replace(source=Address(domain="red")),
         MESSAGE._replace(destination=Address("", 256)),
         MESSAGE._replace(destination=Address("", -2)),
         MESSAGE._replace(payload="olá".encode()),
