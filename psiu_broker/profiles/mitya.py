@@ -185,6 +185,9 @@ class Realigner:
     What makes it begin is any other error: an E0002 may be a command cut at a wrong place, and E0003 to E0006 end a
     recording, which noise may have begun. E0001 ends one too, so that nothing asked after these disturbs one. It needs
     no clock: an answer that does not come is not waited for.
+
+    The first question is put twice: a body that somebody left recording may take one W0000 for a delay of its script,
+    but of two in a row one has no command before it, and ends the recording.
     """
 
     def __init__(self) -> None:
@@ -193,17 +196,21 @@ class Realigner:
         self.in_step: bool | None = None
         """What the last answer told; None: nothing yet."""
         self._fillers = 0
+        self._awaited = 0
+        self._odd = False
+        """It has said of something that it is no command, since the first question."""
         self._out = False
         self._taken: Frame | None = None
 
-    def next(self) -> bytes:
+    def next(self) -> Sequence[bytes]:
         """What to send now: the next of what `heard` wants, else the first question."""
         if self._out:
             self._out = False
             self._fillers += 1
-            return _FILLER + _ASK
-        self.asking, self._fillers = True, 0
-        return _ASK
+            self._awaited = 1
+            return (_FILLER + _ASK,)
+        self.asking, self._fillers, self._awaited, self._odd = True, 0, 2, False
+        return (_ASK, _ASK)
 
     def heard(self, frame: Frame) -> bool:
         """Take note of a frame of the body; True if something is to be sent: call `next`."""
@@ -211,21 +218,29 @@ class Realigner:
             return False
         code = mitya.number(frame.payload)
         if not self.asking:
-            self._taken = None
+            self._taken = frame if code == 0x07 and self._awaited else None
+            self._awaited = 0
             return 0 < code < 0x07
         if code in (0x04, 0x06, 0x07):  # W was read as a letter, by a body that was recording or not
-            self.asking, self.in_step, self._taken = False, True, frame
+            self.asking, self.in_step, self._out, self._taken = False, True, False, frame
+            self._awaited -= 1
         elif code == 0x01:
             self.in_step, self._taken = False, frame
-            self.asking = self._out = self._fillers < FILLERS
-        elif code == 0x02 and self._fillers:
-            self._taken = frame  # five zeros, of which it asked for no more than four
+            self._awaited -= 1
+            if self._awaited <= 0:
+                self.asking = self._out = self._fillers < FILLERS
+        elif code == 0x02 and self._odd:  # the answer was lost
+            self.asking, self._taken = False, None
+            return True
+        elif code == 0x02:  # behind fillers five zeros, of which it asked for no more than four
+            self._odd, self._taken = True, frame if self._fillers else None
         return self._out
 
     def forget(self) -> None:
         """Something else is sent now: an answer that has not come yet does not come, or is to that."""
         if self.in_step is not False:
             self.asking = self._out = False
+            self._awaited = 0
 
     def took(self, frame: Frame) -> bool:
         """Whether `frame` was the answer to what was asked here, and so is to no command."""
@@ -326,10 +341,10 @@ class MityaProfile(Profile):
         return ""
 
     def greeting(self) -> Sequence[Request]:
-        """The next question by which a 2012 body is realigned; not for one that is recording a script."""
+        """The next question by which a 2012 body is realigned; the first one also ends what it may be recording."""
         if self._realigner is None:
             return ()
-        return (Request(REALIGN, self._realigner.next(), True, self._timeout_s, SENT),)
+        return [Request(REALIGN, asked, True, self._timeout_s, SENT) for asked in self._realigner.next()]
 
     def learn(self, frame: Frame) -> bool:
         """True when the body may be out of step, and the next `greeting` asks on."""
