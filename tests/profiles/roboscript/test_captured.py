@@ -1,5 +1,7 @@
 """Compiling and its way back."""
 
+from functools import cache
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +10,7 @@ from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.mitya import Mitya, Version
 from psiu_broker.frame import Frame
 from psiu_broker.profiles.roboscript import Action, compiled, decompiled, read, vocabulary
-from psiu_broker.profiles.roboscript.script import ACTIONS_MAX, TOTAL_MS, Vocabulary
+from psiu_broker.profiles.roboscript.script import ACTIONS_MAX, TOTAL_MS
 
 VERSIONS: list[Version] = ["2012", "2013"]
 WORDS = {version: vocabulary(version) for version in VERSIONS}
@@ -16,9 +18,10 @@ UPLOAD = b"r0103Z0002D0064W01F4D0000W0000Z0000"
 SCRIPT = "# Robot Mitya 2012, slot 3: 2 actions, 500 ms\ndrive 100\nwait 500\ndrive 0\n"
 
 
-def values(words: Vocabulary, name: str) -> st.SearchStrategy[int]:
+@cache
+def values(version: Version, name: str) -> st.SearchStrategy[int]:
     """The 16 bits of any value that the action takes."""
-    form = words.forms[name]
+    form = WORDS[version].forms[name]
 
     def taken(value: int) -> bool:
         try:
@@ -27,8 +30,7 @@ def values(words: Vocabulary, name: str) -> st.SearchStrategy[int]:
             return False
         return True
 
-    low, high = (-300, 400) if form.word != "mood" else (0, 0x0200)
-    return st.integers(low, high).filter(taken).map(lambda value: value & 0xFFFF)
+    return st.sampled_from([value & 0xFFFF for value in range(-300, 0x200) if taken(value)])
 
 
 @st.composite
@@ -41,7 +43,7 @@ def scripts(draw: st.DrawFn) -> tuple[Version, list[Action]]:
     for name in draw(st.lists(st.sampled_from(names), min_size=1, max_size=12)):
         delay_ms = draw(st.integers(0, left_ms))
         left_ms -= delay_ms
-        actions.append(Action(words.forms[name].letter, draw(values(words, name)), delay_ms))
+        actions.append(Action(words.forms[name].letter, draw(values(version, name)), delay_ms))
     return version, actions
 
 
