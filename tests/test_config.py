@@ -253,6 +253,19 @@ def test_an_unknown_key_is_refused_with_the_one_that_was_meant(problems, text, e
         (RADIO + "nak = 1", "links.radio.nak: expected true or false, got 1"),
         (RADIO + "max_age_s = 0", "links.radio.max_age_s: expected a number greater than 0, got 0"),
         (RADIO + "max_age_s = inf", "links.radio.max_age_s: expected a finite number, got inf"),
+        (RADIO + "question_max_age_s = 0", "links.radio.question_max_age_s: expected a number greater than 0, got 0"),
+        (RADIO + "max_frames_s = 0", "links.radio.max_frames_s: expected a number greater than 0, got 0"),
+        (RADIO + 'max_bytes_s = "960"', 'links.radio.max_bytes_s: expected a number, got "960"; write it without'),
+        (RADIO + 'newest_wins = "node/4"', 'links.radio.newest_wins: expected a list, got "node/4"; write it in'),
+        (RADIO + 'newest_wins = ["a b"]', "links.radio.newest_wins[0]: expected one word, * for any letters, got"),
+        (RADIO + "limits.parafrente = 5", "links.radio.limits.parafrente: expected a table, got 5"),
+        (RADIO + "limits.parafrente = {}", "links.radio.limits.parafrente: expected frames_s or bytes_s, got neither"),
+        (
+            RADIO + 'limits."node/*" = {frame_s = 5}',
+            'links.radio.limits."node/*".frame_s: unknown key; did you mean frames_s?',
+        ),
+        (RADIO + 'limits."a b" = {frames_s = 5}', 'links.radio.limits."a b": expected one word, * for any letters'),
+        (CAMPO + "max_frames_s = 5", "links.campo.max_frames_s: soccer sends packets at rate_hz, each with the newest"),
         (RADIO + "timeout_s = nan", "links.radio.timeout_s: expected a finite number, got nan"),
         (
             RADIO + 'parity = "evne"',
@@ -818,3 +831,11 @@ def test_whatever_the_file_says_the_author_gets_whole_lines_and_never_a_tracebac
         for line in error.problems:
             assert line.startswith(str(path))
             assert line.splitlines() == [line]
+
+
+def test_what_may_leave_on_a_link_is_limited_in_all_and_by_subject(read):
+    more = 'max_frames_s = 20\nmax_bytes_s = 480.5\nnewest_wins = ["node/*", "motor"]\n'
+    options = read(BROKER + RADIO + more + 'limits."node/*" = {frames_s = 9, bytes_s = 90}\n').links["radio"].options
+    assert (options.max_frames_s, options.max_bytes_s, options.newest_wins) == (20, 480.5, ("node/*", "motor"))
+    assert [(name, each.frames_s, each.bytes_s) for name, each in options.limits.items()] == [("node/*", 9, 90)]
+    assert (options.longest_wait_s("parafrente"), options.longest_wait_s("ExibeComandos")) == (2.0, 4.0)

@@ -60,6 +60,15 @@ def test_the_memory_survives_a_change_of_generation() -> None:
     assert duplicates.is_double(b"frame", WIFI, 1.5)
 
 
+def test_questions_which_may_wait_longer_have_a_longer_window() -> None:
+    duplicates = Duplicates(1.0, question_s=3.0)
+    for subject, at, double in (("qualseunome", 2.9, True), ("parafrente", 1.0, True), ("parafrente", 1.1, False)):
+        key = subject, at
+        assert not duplicates.is_double(key, RADIO, 0.0, subject)
+        assert duplicates.knows(key, WIFI, at, subject) is double
+        assert duplicates.is_double(key, WIFI, at, subject) is double
+
+
 def test_a_double_does_not_count_as_heard() -> None:
     duplicates = Duplicates(1.0)
     duplicates.is_double(b"other", RADIO, 0.0)

@@ -1,3 +1,6 @@
+from collections.abc import Hashable
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -7,12 +10,15 @@ from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE, F
 ARRIVED = Way("wifi")
 
 
-def frame(subject: str = "parafrente") -> Frame:
-    return Frame(Address.named("PC"), Address.named("MNERIM"), subject, subject.encode(), "psiu-ascii")
+def frame(subject: str = "parafrente", robot: str = "MNERIM", words: str = "") -> Frame:
+    payload = f"{subject} {words}".rstrip().encode()
+    return Frame(Address.named("PC"), Address.named(robot), subject, payload, "psiu-ascii")
 
 
-def parcel(name: str, lane: int = COMMAND_LANE, expires: float = 10.0, peer: object = None) -> Parcel:
-    return Parcel(name.encode(), peer, lane, 0.0, expires, Fate(frame(), ARRIVED))
+def parcel(
+    name: str, lane: int = COMMAND_LANE, expires: float = 10.0, peer: object = None, key: Hashable = None
+) -> Parcel:
+    return Parcel(name.encode(), peer, lane, 0.0, expires, Fate(frame(), ARRIVED), key=key)
 
 
 def names(parcels: list[Parcel]) -> str:
@@ -37,7 +43,58 @@ def test_the_words_decide_the_lane() -> None:
     assert lane(frame("pare")) == lane(frame("PARE")) == STOP_LANE
     assert lane(frame("parafrente")) == COMMAND_LANE
     assert lane(frame("node/4")) == COMMAND_LANE
-    assert lane(frame("qualseunome")) == QUESTION_LANE
+    assert lane(frame("qualseunome")) == lane(frame("QualSeuNome")) == QUESTION_LANE
+
+
+@pytest.mark.parametrize("status", ["sucesso", "falha", "OK"])
+def test_the_answer_to_a_stop_is_no_stop(status: str) -> None:
+    assert lane(frame("pare", "PC", status)) == COMMAND_LANE
+    assert lane(frame("pare", "MNERIM", "agora")) == STOP_LANE
+
+
+def test_a_stop_takes_out_what_would_move_its_robot_again_and_no_answer() -> None:
+    outbox = Outbox()
+    moves = [Fate(frame("parafrente", "MNERIM"), ARRIVED), Fate(frame("luz", "LAMP"), ARRIVED)]
+    answer = Fate(frame("parafrente", "MNERIM", "sucesso"), ARRIVED)
+    for fate in (*moves, answer):
+        outbox.put(Parcel(b"", None, COMMAND_LANE, 0.0, 10.0, fate))
+    stop = Parcel(b"", None, STOP_LANE, 0.0, 10.0, Fate(frame("pare", "MNERIM"), ARRIVED))
+    assert [each.fate for each in outbox.overtaken(stop)] == [moves[0]]
+    everyone = stop._replace(fate=Fate(frame("pare", "??"), ARRIVED))
+    assert outbox.overtaken(everyone._replace(peer="another")) == []
+    assert [each.fate for each in outbox.overtaken(everyone)] == [moves[1]]
+    assert [each.fate for each in outbox] == [answer]
+
+
+def test_a_newer_set_point_takes_the_place_of_the_older_and_has_its_own_age() -> None:
+    outbox = Outbox(3)
+    older = parcel("a1", key="a", expires=1.0)
+    for item in (older, parcel("b1", key="b"), parcel("c")):
+        outbox.put(item)
+    newer = parcel("a2", key="a", expires=2.0)
+    assert outbox.swap(newer) is older
+    assert outbox.swap(parcel("d1", key="d")) is None
+    assert outbox.expire(1.0) == []
+    assert taken(outbox) == "a2 b1 c"
+
+
+def test_what_a_limit_holds_back_is_passed_over_and_keeps_its_place() -> None:
+    outbox = Outbox()
+    for name in ("slow1", "quick", "slow2"):
+        outbox.put(parcel(name))
+    first = outbox.take(held=lambda parcel: parcel.wire.startswith(b"slow"))
+    assert first is not None
+    assert first.wire == b"quick"
+    assert taken(outbox) == "slow1 slow2"
+
+
+def test_only_what_is_as_urgent_is_waited_behind() -> None:
+    outbox = Outbox()
+    outbox.put(parcel("c", peer=1))
+    assert outbox.waits_for(1, COMMAND_LANE)
+    assert outbox.waits_for(1, QUESTION_LANE)
+    assert not outbox.waits_for(1, STOP_LANE)
+    assert not outbox.waits_for(2, QUESTION_LANE)
 
 
 def test_when_full_the_oldest_of_the_least_urgent_goes() -> None:
@@ -99,34 +156,79 @@ def test_a_frame_that_went_two_ways_is_delivered_if_one_copy_was() -> None:
 
 steps = st.lists(
     st.one_of(
-        st.tuples(st.just("put"), st.integers(0, 2), st.floats(0, 10)),
-        st.tuples(st.just("take"), st.just(0), st.just(0.0)),
-        st.tuples(st.just("expire"), st.just(0), st.floats(0, 10)),
-        st.tuples(st.just("remove_peer"), st.integers(0, 2), st.just(0.0)),
-    )
+        st.tuples(st.just("put"), st.integers(0, 2), st.integers(0, 10), st.sampled_from([1, 2])),
+        st.tuples(st.just("set"), st.integers(1, 3), st.integers(0, 10), st.sampled_from([1, 2])),
+        st.tuples(st.just("take"), st.just(0), st.just(0), st.sampled_from([0, 1])),
+        st.tuples(st.just("return"), st.just(0), st.just(0), st.sampled_from([0, 1])),
+        st.tuples(st.just("expire"), st.just(0), st.integers(0, 10), st.just(0)),
+        st.tuples(st.just("remove_peer"), st.just(0), st.just(0), st.sampled_from([1, 2])),
+        st.tuples(st.just("stop"), st.just(0), st.just(10), st.sampled_from([1, 2])),
+    ),
+    max_size=60,
 )
 
 
-@given(steps, st.integers(1, 5))
-def test_every_parcel_comes_out_exactly_once(steps: list[tuple[str, int, float]], capacity: int) -> None:
+@given(steps, st.integers(1, 6))
+def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
+    steps: list[tuple[str, int, int, int]], capacity: int
+) -> None:
+    """Each parcel comes out once; of a lane and a peer in order; none too late; of a set-point only the newest."""
     outbox = Outbox(capacity)
-    put: list[int] = []
+    every: list[Parcel] = []
     out: list[int] = []
-    kept = []
-    for action, lane_or_peer, at in steps:
-        if action == "put":
-            item = parcel("x", lane_or_peer, at, peer=lane_or_peer)
-            kept.append(item)
-            put.append(id(item))
-            evicted = outbox.put(item)
-            out += [] if evicted is None else [id(evicted)]
-        elif action == "take":
-            item_or_none = outbox.take()
-            out += [] if item_or_none is None else [id(item_or_none)]
-        elif action == "expire":
-            out += map(id, outbox.expire(at))
+    place: dict[int, int] = {}
+    newest: dict[Hashable, Parcel] = {}
+    gone_up_to: dict[tuple[int, object], int] = {}
+
+    def put(item: Parcel) -> None:
+        every.append(item)
+        place.setdefault(id(item), len(every))
+        evicted = outbox.put(item)
+        if evicted is not None:
+            assert evicted.lane == max(each.lane for each in (*outbox, evicted)), "the least urgent goes"
+            out.append(id(evicted))
+
+    def set_to(item: Parcel) -> None:
+        newest[item.key] = item
+        older = outbox.swap(item)
+        if older is None:
+            put(item)
         else:
-            out += map(id, outbox.remove_peer(lane_or_peer))
+            every.append(item)
+            place[id(item)] = place[id(older)]
+            out.append(id(older))
+
+    for action, number, at, peer in steps:
+        if action == "put":
+            put(parcel("x", number, at, peer))
+        elif action == "set":
+            set_to(parcel("x", COMMAND_LANE, at, peer, key=(number, peer)))
+        elif action == "stop":
+            stop = parcel("stop", STOP_LANE, at, peer)
+            out += map(id, outbox.overtaken(stop))
+            put(stop)
+            assert not any(each.lane == COMMAND_LANE and each.peer == peer for each in outbox)
+        elif action in ("take", "return"):
+            first = outbox.take({peer})
+            if first is None:
+                assert all(each.peer == peer for each in outbox)
+            else:
+                assert not any(each.lane < first.lane and each.peer != peer for each in outbox)
+                if action == "return":
+                    outbox.put_back(first)
+                else:
+                    assert gone_up_to.get((first.lane, first.peer), 0) < place[id(first)]
+                    gone_up_to[first.lane, first.peer] = place[id(first)]
+                    out.append(id(first))
+        elif action == "expire":
+            late = outbox.expire(at)
+            assert all(each.expires <= at for each in late)
+            assert all(each.expires > at for each in outbox)
+            out += map(id, late)
+        else:
+            out += map(id, outbox.remove_peer(peer))
+            assert not any(each.peer == peer for each in outbox)
         assert outbox.size == len(list(outbox)) <= capacity
+        assert all(each is newest[each.key] for each in outbox if each.key is not None)
     out += map(id, outbox.clear())
-    assert sorted(out) == sorted(put)
+    assert sorted(out) == sorted(map(id, every))
