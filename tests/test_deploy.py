@@ -5,6 +5,8 @@ import re
 import shutil
 import stat
 import subprocess
+import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,8 @@ SERVICE = DEPLOY / "psiu-broker.service"
 EXAMPLE = DEPLOY / "examples" / "psiu-broker.toml"
 SYSTEMD_ANALYZE = shutil.which("systemd-analyze")
 SYSTEMD_SYSUSERS = shutil.which("systemd-sysusers")
+SYSTEMD_TMPFILES = shutil.which("systemd-tmpfiles")
+GUIDE = (DEPLOY / "README.md").read_text()
 
 
 @pytest.mark.skipif(SYSTEMD_ANALYZE is None, reason="systemd-analyze is missing: the unit is NOT checked")
@@ -127,3 +131,36 @@ def test_the_example_is_the_readme_s_configuration_and_loads_without_a_warning()
 
 def test_the_changelog_tells_of_this_version():
     assert f"## {__version__}" in (TREE / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+@pytest.mark.skipif(
+    None in (SYSTEMD_SYSUSERS, SYSTEMD_TMPFILES), reason="systemd-tmpfiles is missing: no folder is made"
+)
+def test_the_broker_reads_the_keys_that_the_guide_has_installed_and_nobody_else_does(tmp_path):
+    for kind in ("sysusers", "tmpfiles"):
+        folder = tmp_path / f"usr/lib/{kind}.d"
+        folder.mkdir(parents=True)
+        shutil.copy(DEPLOY / f"psiu-broker.{kind}", folder / "psiu-broker.conf")
+    (tmp_path / "etc/psiu-broker").mkdir(parents=True)
+    run = partial(subprocess.run, check=True, capture_output=True, text=True)
+    run([SYSTEMD_SYSUSERS, f"--root={tmp_path}", "psiu-broker.conf"])
+    run([SYSTEMD_TMPFILES, "--create", f"--root={tmp_path}", "psiu-broker.conf"])
+    keys = tmp_path / "etc/psiu-broker/keys"
+    [gid] = re.findall(r"^psiu-broker:[^:]*:(\d+):", (tmp_path / "etc/group").read_text(), re.MULTILINE)
+    told = (keys.stat().st_uid, keys.stat().st_gid, stat.S_IMODE(keys.stat().st_mode))
+    assert told == (0, int(gid), 0o750)
+
+    [script] = [text for text in re.findall(r"```sh\n(.*?)```", GUIDE, re.DOTALL) if "psiu-broker keys" in text]
+    script = script.replace("/opt/psiu-broker/bin", str(Path(sys.executable).parent)).replace(
+        "-g psiu-broker", f"-g {gid}"
+    )
+    made = run(["sh", "-ec", script.replace("/root/", f"{tmp_path}/root/").replace("/etc/", f"{tmp_path}/etc/")])
+    assert {file.name: f"{stat.S_IMODE(file.stat().st_mode):o}" for file in keys.iterdir()} == {
+        "ca.pem": "644", "base.pem": "644", "base.key": "640",
+    }  # fmt: skip
+    assert keys.joinpath("base.key").stat().st_gid == int(gid)
+    file = tmp_path / "etc/psiu-broker/psiu-broker.toml"
+    tables = made.stdout.partition("[zenoh]")[2].replace(f"{tmp_path}/root/keys", "keys")
+    file.write_text(f'[broker]\nname = "base"\n[zenoh]{tables}')
+    assert load(file).warnings == ()

@@ -11,9 +11,18 @@ from typing import Any, get_args
 import click
 import pytest
 from pydantic import BaseModel, TypeAdapter
+from secure_keys import make_keys
 
 from psiu_broker.cli import daemon, tool
-from psiu_broker.config import BrokerConfiguration, LinkOptions, MeshConfiguration, ZenohConfiguration, load
+from psiu_broker.config import (
+    AccessConfiguration,
+    BrokerConfiguration,
+    LinkOptions,
+    MeshConfiguration,
+    TlsConfiguration,
+    ZenohConfiguration,
+    load,
+)
 from psiu_broker.config.tables import RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
@@ -28,10 +37,13 @@ GROUPS: dict[str, click.Group] = {"psiu": tool.psiu, "psiu-broker": daemon.psiu_
 
 MANY_BROKERS = re.compile(r"^## (?:Many|Muitos) brokers\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 PROTOCOLS_TOLD = re.compile(r"^## (?:Protocols|Protocolos)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+RIGHTS_TOLD = re.compile(r"^## (?:Who may do what|Quem pode o quê)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MODELS: dict[str, type[BaseModel]] = {
     "[broker]": BrokerConfiguration,
     "[zenoh]": ZenohConfiguration,
+    "[zenoh.tls]": TlsConfiguration,
+    "[zenoh.access]": AccessConfiguration,
     "[mesh]": MeshConfiguration,
     "[links.NAME]": LinkOptions,
     "[robots.NAME]": RobotTable,
@@ -90,7 +102,9 @@ def test_both_languages_have_the_same_sections_examples_and_tables() -> None:
 @READMES
 def test_ten_minutes_of_reading(readme: str) -> None:
     [many], [protocols] = MANY_BROKERS.findall(readme), PROTOCOLS_TOLD.findall(readme)
-    assert _words(readme) - _words(many) - _words(protocols) <= 2300
+    [rights] = RIGHTS_TOLD.findall(readme)
+    assert _words(readme) - _words(many) - _words(protocols) - _words(rights) <= 2300
+    assert _words(rights) <= 200
     assert _words(many) <= 650
     assert _words(protocols) <= 600
 
@@ -115,10 +129,12 @@ def test_the_configurations_load(readme: str, tmp_path: Path) -> None:
 @READMES
 def test_the_tables_for_many_brokers_load(readme: str, tmp_path: Path) -> None:
     tables = [block for block in blocks(readme, "toml") if re.match(r"\[(?:zenoh|mesh|trunks)\b", block)]
+    make_keys(tmp_path / "keys", ["base"], [])
     file = tmp_path / "broker.toml"
     file.write_text("\n".join(['[broker]\nname = "base"', *tables]))
     configuration = load(file)
     assert configuration.mesh.connect
+    assert configuration.zenoh.access is not None
     assert set(configuration.trunks) == {"base"}
     assert "**`[trunks.NAME]`**" in readme
 
