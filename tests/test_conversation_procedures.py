@@ -232,6 +232,15 @@ async def test_a_stop_ends_the_recording_first(number: int) -> None:
 
 
 @jumping
+async def test_a_stop_is_not_too_late_for_what_had_to_be_ended_before_it() -> None:
+    body = Body(Robots())
+    task = await uploading(body, 4)
+    await body.call("stop", timeout_s=0.05)
+    await refused(task)
+    assert body.heard[4:] == [*ENDING, "D0000"]
+
+
+@jumping
 async def test_two_stops_end_it_once() -> None:
     body = Body(Robots())
     task = await uploading(body, 4)

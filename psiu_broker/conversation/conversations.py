@@ -230,12 +230,14 @@ class Conversations:
     async def _turn(self, call: UnderWay, *, replaceable: bool) -> AsyncIterator[None]:
         """Wait until no other call to this robot is under way, or, for a stop, until no procedure is."""
         self._refuse_when_closed()
-        robot = call.robot
+        robot, loop = call.robot, asyncio.get_running_loop()
+        came = loop.time()
         if call.is_stop or call.is_ending:
             await self._procedures.interrupt(robot.address, call.command, call.leave_by)
         if call.is_stop:
             await self._procedures.mend(robot)
             self._refuse_when_closed()
+            call.put_off(loop.time() - came)  # what had to be ended first must not make a stop too late
             self._overtake(call)
             with self.hearing(call):
                 yield

@@ -83,6 +83,11 @@ class UnderWay:
     def has_reply(self) -> bool:
         return any(isinstance(reading, Reply) for reading, _ in self.heard)
 
+    def put_off(self, seconds: float) -> None:
+        """Let it leave, and be answered, so much later."""
+        self.leave_by += seconds
+        self.deadline += seconds
+
     def taken(self, frame: Frame) -> Offer | None:
         """What `frame`, itself and not one like it, was offered as, which waits no more; None if it did not wait."""
         offer = next((each for each in self.waiting if each.frame is frame), None)
