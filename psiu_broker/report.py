@@ -28,6 +28,8 @@ from psiu_broker.messages import Trunk as TrunkMessage
 from psiu_broker.routing import table, verdicts
 from psiu_broker.routing.books import Told
 from psiu_broker.routing.claims import BEST
+from psiu_broker.routing.guard import Refusal
+from psiu_broker.routing.policy import Rule
 from psiu_broker.routing.router import SELF, Decision
 from psiu_broker.trunk import Trunk
 
@@ -208,7 +210,8 @@ class Report:
         """What would become of a frame from `source` to `destination` now, step by step; nothing is sent."""
         origin = self._router.find(source)
         steps = [self._where(source, origin)]
-        arrived = SELF if origin is None else origin.way
+        last = self._router.guard.last_refusal(source)
+        arrived = origin.way if origin is not None else SELF if last is None else last.way
         target = self._router.find(destination)
         protocol = origin.protocol if origin is not None else target.protocol if target is not None else "psiu-ascii"
         decision = self._router.decide(destination, protocol, arrived)
@@ -216,6 +219,11 @@ class Report:
             steps.append(self._where(destination, target))
         steps.append(self._outcome(decision, destination, protocol, target))
         verdict = decision.verdict or _ENDS[decision.action]
+        denied = self._policed(source, destination, arrived, steps) if decision.verdict is None else None
+        if denied is not None:
+            decision, verdict = Decision("drop", verdict=verdicts.DENIED), verdicts.DENIED
+        if last is not None:
+            steps.append(self._turned_away(source, origin, last))
         ways = decision.hops
         if not ways and target is not None and decision.action in ("translate", "drop"):
             ways = (target.way,)
@@ -234,9 +242,36 @@ class Report:
             via=None if not brokers else brokers.pop() if len(brokers) == 1 else "*",
             link=None if link is None else link.name,
             age_s=None if heard_at is None else round(self._clock() - heard_at, 3),
-            filter=self._filter(decision, protocol, arrived, target, link),
+            filter=self._filter(decision, protocol, arrived, target, link) if denied is None else str(denied),
             cost_ms=None if link is None or decision.verdict is not None else _cost_ms(link),
         )
+
+    def _policed(self, source: Address, destination: Address, arrived: Way, steps: list[str]) -> Rule | None:
+        """What denies commands from one to the other, whatever they are; `steps` tells of it, and of single ones."""
+        policy = self._router.policy
+        if policy is None:
+            return None
+        some, rest = policy.about(source, destination, arrived)
+        steps += [f"some commands: {rule}" for rule in some]
+        if rest is not None:
+            steps.append(f"{'other ' if some else ''}commands are denied, not answers and questions: {rest}")
+        return rest
+
+    def _turned_away(self, source: Address, origin: table.Route | None, last: Refusal) -> str:
+        """The last frame in the name of `source` that was not listened to."""
+        ago_s = self._clock() - last.at
+        match last.verdict:
+            case "spoofed" if origin is not None and origin.way == SELF:
+                reason = f"{source} is this broker itself"
+            case "spoofed" if origin is not None:
+                reason = f"the configuration puts {source} on {origin.home}"
+            case "denied":
+                reason = str(last.rule)
+            case _:
+                reason = _REASONS.get(last.verdict, last.verdict)
+        what = f"{last.subject or 'a frame'} for {last.destination} from {last.way}"
+        count = f"{last.count} frames of {source}, the last" if last.count > 1 else f"a frame of {source}"
+        return f"turned away: {count} {ago_s:.1f} s ago, {what} ({last.verdict}): {reason}"
 
     def _where(self, address: Address, route: table.Route | None) -> str:
         now = self._clock()
@@ -336,6 +371,8 @@ _REASONS = {
     "same_way": "both are on one line, where it was heard already",
     "link_down": "its link is down",
     "refused": "it speaks another protocol, and there is no translation",
+    "too_many_names": "more new names than new_names_per_minute came on that link",
+    "storm": "too many frames to everyone came from that link",
 }
 
 

@@ -11,6 +11,7 @@ from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Why
 from psiu_broker.report import Report
+from psiu_broker.routing.policy import Policy, Rule
 from psiu_broker.routing.router import ANY, SELF, Port, Router
 from psiu_broker.routing.table import Binding
 
@@ -161,3 +162,68 @@ def test_routes_tell_of_the_robots_of_other_brokers(world: World) -> None:
         "BRACO": "static", "FAR": "mesh", "north": "mesh", "PC": "learned", "MNERIM": "learned",
     }  # fmt: skip
     assert (routes["FAR"].link, routes["FAR"].peer, routes["FAR"].expires_in_s) == (MESH, "north", None)
+
+
+# Who may command whom.
+
+
+def deny(world: World, *rules: Rule) -> None:
+    world.router.obey(Policy(rules, {BASE}))
+
+
+def test_a_rule_that_denies_all_commands_stops_them_and_is_quoted(world: World) -> None:
+    deny(world, Rule(False, source=("P*",), where="policy[0]"))
+    why = world.why(PC, MNERIM)
+    assert (why.delivered, why.verdict, why.cost_ms) == (False, "denied", None)
+    assert why.filter == "policy[0] denies source P*"
+    assert why.steps[-1] == "commands are denied, not answers and questions: policy[0] denies source P*"
+    assert world.why(MNERIM, PC).delivered
+    assert world.why(PC, BASE).delivered
+
+
+def test_rules_for_single_commands_are_told_and_the_rest_is_delivered(world: World) -> None:
+    deny(world, Rule(False, command=("para*",), where="policy[0]"), Rule(True, link=("wifi",), where="policy[1]"))
+    why = world.why(PC, MNERIM)
+    assert why.delivered
+    assert why.steps[-1] == "some commands: policy[0] denies command para*"
+
+
+def test_what_keeps_programs_on_the_bus_from_a_robot_is_told(world: World) -> None:
+    deny(world, Rule(False, source=("base",), where="policy[0]"))
+    assert world.why(BASE, MNERIM).verdict == "denied"
+
+
+def test_the_last_that_was_turned_away_is_told_with_its_reason(world: World) -> None:
+    deny(world, Rule(False, source=("RUIM",), where="policy[0]"))
+    for number in range(3):
+        world.router.route(message(Address.named("RUIM"), MNERIM, "parafrente", str(number)), Way("wifi"), world.now)
+    world.now += 2
+    why = world.why(Address.named("RUIM"), MNERIM)
+    assert (why.verdict, why.filter) == ("denied", "policy[0] denies source RUIM")
+    assert why.steps[-1] == (
+        "turned away: 3 frames of RUIM, the last 2.0 s ago, parafrente for MNERIM from wifi (denied):"
+        " policy[0] denies source RUIM"
+    )
+
+
+def test_a_name_that_is_used_elsewhere_is_told_with_where_it_belongs(world: World) -> None:
+    world.router.route(message(Address.named("BRACO"), MNERIM, "parafrente", "1"), Way("wifi"), world.now)
+    world.router.route(message(BASE, MNERIM, "parafrente", "1"), Way("wifi"), world.now)
+    assert world.why(Address.named("BRACO"), MNERIM).steps[-1] == (
+        "turned away: a frame of BRACO 0.0 s ago, parafrente for MNERIM from wifi (spoofed):"
+        " the configuration puts BRACO on arm"
+    )
+    assert world.why(BASE, MNERIM).steps[-1].endswith("(spoofed): base is this broker itself")
+
+
+def test_storms_and_names_too_many_are_told(world: World) -> None:
+    for number in range(60):
+        world.router.route(message(PC, EVERYONE, "qualseunome", str(number)), Way("wifi"), world.now)
+    assert world.why(PC, MNERIM).steps[-1].endswith("(storm): too many frames to everyone came from that link")
+    for number in range(60):
+        world.router.route(message(Address.named(f"R{number}"), BASE, "qualseunome"), Way("wifi"), world.now)
+    assert (
+        world.why(Address.named("R59"), MNERIM)
+        .steps[-1]
+        .endswith("(too_many_names): more new names than new_names_per_minute came on that link")
+    )

@@ -168,12 +168,20 @@ def _glob(glob: str) -> str:
 
 
 def _several(globs: object) -> object:
-    return [globs] if isinstance(globs, str) else globs
+    return tuple([globs] if isinstance(globs, str) else globs) if isinstance(globs, str | list) else globs
+
+
+def _some(globs: tuple[str, ...]) -> tuple[str, ...]:
+    if not globs:
+        raise ValueError("expected at least one name, got none; leave it out for all")
+    return globs
 
 
 Glob = Annotated[str, AfterValidator(_glob)]
 Globs = Annotated[
-    tuple[Glob, ...], Field(min_length=1), BeforeValidator(_several, json_schema_input_type=Glob | tuple[Glob, ...])
+    tuple[Glob, ...],
+    AfterValidator(_some),
+    BeforeValidator(_several, json_schema_input_type=Glob | tuple[Glob, ...]),
 ]
 
 
@@ -181,7 +189,9 @@ class PolicyRule(_Table):
     """``[[policy]]``: who may command whom. The first rule that fits a command decides."""
 
     action: Literal["allow", "deny"] = Field(description="whether what fits the rest may pass")
-    source: Globs = Field(("*",), description="who commands: names, or globs such as PC*; programs on Zenoh: the broker")
+    source: Globs = Field(
+        ("*",), description="who commands: names, or globs such as PC*; programs on Zenoh: the broker"
+    )
     destination: Globs = Field(("*",), description="who is commanded")
     command: Globs = Field(("*",), description="command words, or node/4 and the like, in any case")
     link: Globs = Field(("*",), description="where it comes in; @self: from programs on Zenoh, @mesh: from a broker")

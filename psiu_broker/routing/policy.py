@@ -55,6 +55,8 @@ class Rule:
     link: tuple[str, ...] = ANY
     where: str = ""
     """Where the configuration says so, as ``policy[0]``."""
+    text: str = ""
+    """The rule in words, where the rest does not tell it."""
     _globs: tuple[_Glob, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +74,8 @@ class Rule:
         )
 
     def __str__(self) -> str:
+        if self.text:
+            return self.text
         named = {"source": self.source, "destination": self.destination, "command": self.command, "link": self.link}
         told = [f"{name} {' or '.join(globs)}" for name, globs in named.items() if globs != ANY]
         verb = "allows" if self.allow else "denies"
@@ -86,7 +90,9 @@ class Rule:
         return _any(to, destination)
 
 
-UNNAMED: Final = Rule(False, where="by default the policy")
+UNNAMED: Final = Rule(
+    False, text="it comes from beyond this computer, and the configuration names neither the sender nor its address"
+)
 """What stops a command from a stranger beyond this computer."""
 
 _MISSING: Final = Rule(False, where="not decided yet")

@@ -1,0 +1,218 @@
+"""What is not listened to: sources that are elsewhere, denied commands, one name too many, storms; and what stays."""
+
+import pytest
+
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
+from psiu_broker.routing.guard import REFUSALS_KEPT, TO_EVERYONE_AT_ONCE, TO_EVERYONE_EVERY_S, Guard
+from psiu_broker.routing.policy import Policy, Rule
+from psiu_broker.routing.router import ANY, SELF, Port, Router
+from psiu_broker.routing.table import Binding
+
+BASE, PC, MNERIM, BETA, GAMA = (Address.named(name) for name in ("base", "PC", "MNERIM", "BETA", "GAMA"))
+RADIO, CABLE = Way("radio"), Way("cable")
+HERS, HIS = Way("wifi", ("192.168.1.20", 9001)), Way("wifi", ("192.168.1.66", 9001))
+
+
+def text(source: Address, destination: Address, word: str = "parafrente", serial: int = 0) -> Frame:
+    wire = f"{destination} {word} {source} {serial}".encode()
+    return Frame(source, destination, word, word.encode(), "psiu-ascii", wire, "psiu-ascii/1")
+
+
+def made(per_minute: int | None = None) -> Router:
+    """MNERIM belongs on the radio, BETA at her address on the Wi-Fi, GAMA anywhere there."""
+    bindings = (
+        Binding(MNERIM, None, RADIO, "psiu-ascii"),
+        Binding(BETA, None, HERS, "psiu-ascii"),
+        Binding(GAMA, None, Way("wifi"), "psiu-ascii"),
+    )
+    router = Router({BASE: "psiu-ascii"}, bindings, lambda frame: frame.wire)
+    router.link_up(Port("radio", "psiu-ascii", lambda: (RADIO,), new_names_per_minute=per_minute))
+    router.link_up(Port("cable", "psiu-ascii", lambda: (CABLE,), new_names_per_minute=per_minute))
+    router.link_up(Port("wifi", "psiu-ascii", lambda: (HERS, HIS), new_names_per_minute=per_minute))
+    router.link_up(Port(MESH, ANY, lambda: (Way(MESH, "north"),)))
+    return router
+
+
+@pytest.fixture
+def router() -> Router:
+    return made()
+
+
+# A source bound to a link.
+
+
+@pytest.mark.parametrize(
+    ("source", "way"), [(MNERIM, CABLE), (MNERIM, HERS), (BETA, HIS), (BETA, RADIO), (GAMA, RADIO), (BASE, RADIO)]
+)
+def test_a_robot_of_the_configuration_is_believed_only_where_that_puts_it(
+    router: Router, source: Address, way: Way
+) -> None:
+    decision = router.route(text(source, PC), way, 0.0)
+    assert (decision.action, decision.verdict, decision.void) == ("drop", "spoofed", True)
+    refusal = router.guard.last_refusal(source)
+    assert refusal is not None
+    assert (refusal.verdict, refusal.way, refusal.count) == ("spoofed", way, 1)
+
+
+@pytest.mark.parametrize(("source", "way"), [(MNERIM, RADIO), (BETA, HERS), (GAMA, HERS), (GAMA, HIS), (PC, CABLE)])
+def test_where_the_configuration_puts_a_robot_it_is_believed_and_so_is_whoever_it_puts_nowhere(
+    router: Router, source: Address, way: Way
+) -> None:
+    assert router.route(text(source, BASE), way, 0.0).action == "answer"
+    assert router.guard.last_refusal(source) is None
+
+
+def test_what_another_broker_heard_is_that_broker_s_to_judge(router: Router) -> None:
+    assert router.route(text(MNERIM, BASE), Way(MESH, "north"), 0.0).action == "answer"
+
+
+def test_nobody_passes_for_this_broker_by_way_of_another(router: Router) -> None:
+    assert router.route(text(BASE, MNERIM), Way(MESH, "north"), 0.0).verdict == "spoofed"
+
+
+def test_the_broker_may_speak_for_any_robot(router: Router) -> None:
+    router.route(text(PC, BASE), CABLE, 0.0)
+    assert router.route(text(MNERIM, PC), SELF, 0.0).action == "forward"
+
+
+def test_an_imitation_does_not_make_the_true_frame_a_double(router: Router) -> None:
+    assert router.route(text(MNERIM, BASE), CABLE, 0.0).verdict == "spoofed"
+    assert router.route(text(MNERIM, BASE), RADIO, 0.1).action == "answer"
+
+
+def test_what_a_second_radio_overhears_of_a_robot_is_a_double_and_no_lie(router: Router) -> None:
+    assert router.route(text(MNERIM, BASE), RADIO, 0.0).action == "answer"
+    assert router.route(text(MNERIM, BASE), CABLE, 0.1).verdict == "duplicate"
+    assert router.guard.last_refusal(MNERIM) is None
+
+
+# A policy.
+
+
+def test_a_denied_command_goes_nowhere_and_teaches_nothing(router: Router) -> None:
+    rule = Rule(False, source=("PC",))
+    router.obey(Policy((rule,), {BASE}))
+    decision = router.route(text(PC, MNERIM), CABLE, 0.0)
+    assert (decision.verdict, decision.void) == ("denied", True)
+    assert router.find(PC) is None
+    refusal = router.guard.last_refusal(PC)
+    assert refusal is not None
+    assert (refusal.rule, refusal.destination, refusal.subject) == (rule, MNERIM, "parafrente")
+
+
+def test_a_denied_command_moves_no_route(router: Router) -> None:
+    router.obey(Policy((Rule(False, link=("wifi",)),), {BASE}))
+    router.route(text(PC, MNERIM), CABLE, 0.0)
+    router.route(text(PC, MNERIM, "paratras"), HIS, 0.1)
+    route = router.find(PC)
+    assert route is not None
+    assert route.way == CABLE
+
+
+def test_a_denied_command_does_not_make_the_same_one_from_elsewhere_a_double(router: Router) -> None:
+    router.obey(Policy((Rule(False, link=("wifi",)),), {BASE}))
+    assert router.route(text(PC, MNERIM), HIS, 0.0).verdict == "denied"
+    assert router.route(text(PC, MNERIM), CABLE, 0.1).action == "forward"
+
+
+def test_nobody_is_asked_for_a_robot_that_may_not_be_commanded(router: Router) -> None:
+    router.obey(Policy((Rule(False, destination=("NOVO",)),), {BASE}))
+    assert router.route(text(PC, Address.named("NOVO")), CABLE, 0.0).verdict == "denied"
+
+
+def test_the_broker_s_own_frames_are_judged_where_they_are_calls(router: Router) -> None:
+    router.obey(Policy((Rule(False),), {BASE}))
+    assert router.route(text(BASE, MNERIM), SELF, 0.0).action == "forward"
+
+
+def test_a_robot_that_another_broker_announces_is_known_by_its_name_from_then_on(router: Router) -> None:
+    number = Address.numbered(9)
+    router.obey(Policy((Rule(False, destination=("FAR",)),), {BASE}))
+    packet = Frame(Address.numbered(3), number, "node/1", b"\x01\x02", "psiu-hexa", b"1", "h")
+    assert router.route(packet, CABLE, 0.0).verdict != "denied"
+    router.announced((Address.named("FAR"), number), Way(MESH, "north"), "psiu-hexa", 1.0)
+    assert router.route(packet._replace(wire=b"2"), CABLE, 2.0).verdict == "denied"
+    router.unannounced(Address.named("FAR"), 3.0)
+    assert router.route(packet._replace(wire=b"3"), CABLE, 4.0).verdict != "denied"
+
+
+def test_a_policy_that_denies_nothing_is_not_asked(router: Router) -> None:
+    router.obey(Policy())
+    assert router.policy is None
+
+
+# New names.
+
+
+def names(router: Router, way: Way, first: int, count: int, now: float) -> list[str | None]:
+    frames = [text(Address.named(f"R{number}"), BASE) for number in range(first, first + count)]
+    return [router.route(frame, way, now).verdict for frame in frames]
+
+
+def test_no_more_new_names_a_minute_than_the_link_may_bring() -> None:
+    router = made(per_minute=6)
+    assert names(router, CABLE, 0, 10, 100.0) == [None] * 6 + ["too_many_names"] * 4
+    assert len(router.robots()) == 3 + 6
+    assert names(router, RADIO, 10, 1, 100.0) == [None], "another link has its own"
+    assert names(router, CABLE, 20, 2, 110.0) == [None, "too_many_names"]
+    assert names(router, CABLE, 30, 10, 170.0) == [None] * 6 + ["too_many_names"] * 4
+
+
+def test_who_is_known_is_heard_however_many_are_not() -> None:
+    router = made(per_minute=6)
+    names(router, CABLE, 0, 100, 0.0)
+    for number in range(6):
+        assert router.route(text(Address.named(f"R{number}"), BASE, serial=1), CABLE, 1.0).action == "answer"
+    assert router.route(text(MNERIM, BASE), RADIO, 1.0).action == "answer", "the configuration knows it"
+
+
+def test_robots_that_come_back_with_their_link_are_not_new() -> None:
+    router = made(per_minute=6)
+    names(router, CABLE, 0, 6, 0.0)
+    router.link_down("cable", 1.0)
+    router.link_up(Port("cable", "psiu-ascii", lambda: (CABLE,), new_names_per_minute=6))
+    assert names(router, CABLE, 0, 6, 2.0) == [None] * 6
+    assert names(router, CABLE, 6, 1, 2.0) == ["too_many_names"], "and nothing new is free by that"
+
+
+# Storms.
+
+
+def question(number: int, word: str = "qualseunome") -> Frame:
+    return text(PC, EVERYONE, word, number)
+
+
+def test_frames_to_everyone_are_damped_to_a_steady_rate_on_the_link_they_come_from(router: Router) -> None:
+    at_once = [router.route(question(number), CABLE, 10.0).verdict for number in range(3 * TO_EVERYONE_AT_ONCE)]
+    assert at_once == [None] * TO_EVERYONE_AT_ONCE + ["storm"] * 2 * TO_EVERYONE_AT_ONCE
+    assert router.route(text(MNERIM, EVERYONE, "qualseunome"), RADIO, 10.0).verdict is None
+    passed = [
+        router.route(question(1000 + tick), CABLE, 20.0 + tick / 100).verdict is None for tick in range(1000)
+    ]  # a hundred a second, for ten seconds
+    assert sum(passed[500:]) == pytest.approx(5.0 / TO_EVERYONE_EVERY_S, abs=1)
+
+
+def test_a_stop_for_everyone_is_never_one_too_many(router: Router) -> None:
+    for number in range(3 * TO_EVERYONE_AT_ONCE):
+        router.route(question(number), CABLE, 10.0)
+    assert router.route(question(1, "pare"), CABLE, 10.0).action == "flood"
+
+
+def test_a_storm_keeps_no_frame_for_one_robot_back(router: Router) -> None:
+    for number in range(3 * TO_EVERYONE_AT_ONCE):
+        router.route(question(number), CABLE, 10.0)
+    assert router.route(text(PC, MNERIM), CABLE, 10.0).action == "forward"
+    assert router.route(question(5000), SELF, 10.0).action == "flood"
+
+
+def test_what_is_remembered_of_those_turned_away_has_an_end() -> None:
+    guard = Guard()
+    for number in range(2 * REFUSALS_KEPT):
+        guard.refused(text(Address.named(f"R{number}"), MNERIM), "spoofed", CABLE, float(number))
+    assert guard.last_refusal(Address.named("R0")) is None
+    last = guard.last_refusal(Address.named(f"R{2 * REFUSALS_KEPT - 1}"))
+    assert last is not None
+    guard.refused(text(Address.named(f"R{2 * REFUSALS_KEPT - 1}"), MNERIM), "denied", RADIO, 1e6)
+    again = guard.last_refusal(Address.named(f"R{2 * REFUSALS_KEPT - 1}"))
+    assert again is not None
+    assert (again.count, again.verdict, again.at) == (2, "denied", 1e6)
