@@ -16,10 +16,11 @@ from psiu_broker.broker import Broker
 from psiu_broker.bus.client import Client
 from psiu_broker.cli.call import answer_line
 from psiu_broker.cli.commands import Failure, examples
+from psiu_broker.cli.ledger import show_ledger
 from psiu_broker.cli.logs import log_to_stderr
 from psiu_broker.cli.monitor import message_line, read_message
 from psiu_broker.cli.output import styled
-from psiu_broker.cli.tables import show_ledger, show_links, show_robots
+from psiu_broker.cli.tables import show_links, show_robots
 from psiu_broker.config import load
 from psiu_broker.errors import PsiuError
 from psiu_broker.messages import Answer, CallRequest, Ledger, Link

@@ -1,11 +1,11 @@
-"""What the brokers know: `psiu robots`, `links`, `routes`, `ledger` and `status`."""
+"""What the brokers know: `psiu robots`, `links`, `routes` and `status`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import click
 
-from psiu_broker.cli.commands import Failure, examples
+from psiu_broker.cli.commands import examples
 from psiu_broker.cli.connection import Connection, connects
 from psiu_broker.cli.output import (
     Cell,
@@ -18,7 +18,7 @@ from psiu_broker.cli.output import (
     printable,
     styled,
 )
-from psiu_broker.messages import Account, Card, Command, Health, Ledger, Link, Route, Status, Trunk
+from psiu_broker.messages import Card, Command, Health, Link, Route, Status, Trunk
 from psiu_broker.profiles.psiu import QUESTIONS
 
 Told = Sequence[tuple[str, Any]]
@@ -26,7 +26,6 @@ Told = Sequence[tuple[str, Any]]
 
 Links = Sequence[tuple[str, Link]]
 Routes = Sequence[tuple[str, Route]]
-Ledgers = Sequence[tuple[str, Ledger]]
 Rows = Sequence[tuple[str, Sequence[Cell]]]
 
 
@@ -99,26 +98,6 @@ def routes(connection: Connection) -> None:
     show_routes([(broker, Route.model_validate(route)) for broker, found in told for route in found])
 
 
-@click.command(epilog=examples("psiu ledger", "psiu ledger --json | jq '.[].balances'"))
-@connects
-def ledger(connection: Connection) -> None:
-    """Show the fate of every frame: arrived = delivered + answered + dropped + waiting.
-
-    In a pipe each line has, between tabs: link, arrived, delivered, answered, dropped, waiting, reasons of the drops,
-    broker. With --json: a list with the ledger of each broker (psiu schema Ledger). The exit code is 1 if the books
-    do not balance.
-    """
-    told = _ask(connection, "ledger")
-    found = [(broker, Ledger.model_validate(each)) for broker, each in told]
-    if connection.as_json:
-        print_json([{"broker": broker, **each} for broker, each in told])
-    else:
-        show_ledger(found, drawn=on_terminal())
-    wrong = [broker for broker, each in found if not each.balances]
-    if wrong:
-        raise Failure(f"the books of {', '.join(wrong)} do not balance: please report it")
-
-
 @click.command(epilog=examples("psiu status", "psiu status --json | jq '.[].healthy'"))
 @connects
 def status(connection: Connection) -> None:
@@ -143,7 +122,7 @@ def show_robots(cards: Sequence[Card], *, drawn: bool) -> None:
     if drawn:
         heads = ("robot", "protocol", "where", "state", "last heard", "commands")
         rows = [(card.broker, _robot(card)) for card in cards]
-        print_table(*_with_brokers(heads, rows), "No robot is known yet. Ask who is there: psiu discover")
+        print_table(*with_brokers(heads, rows), "No robot is known yet. Ask who is there: psiu discover")
         return
     print_rows(
         (c.robot, c.address, c.protocol, c.link, c.peer, c.link_state, c.last_heard, c.frames_heard,
@@ -195,7 +174,7 @@ def show_links(found: Links, *, drawn: bool) -> None:
         heads = ("link", "adapter", "protocol", "state", *counted)
         rows = [(broker, _link(link)) for broker, link in found]
         nothing = "The broker has no links: add [links.NAME] to its configuration."
-        print_table(*_with_brokers(heads, rows), nothing)
+        print_table(*with_brokers(heads, rows), nothing)
         for _, link in found:
             if link.reason:
                 click.echo(f"{link.name} is {link.state}: {printable(link.reason)}")
@@ -216,7 +195,7 @@ def show_trunks(found: Sequence[tuple[str, Trunk]]) -> None:
     click.echo()
     heads = ("trunk", "adapter", "state", "far end", "bytes in", "bytes out")
     rows = [(broker, (t.name, t.adapter, t.state, t.far, t.bytes_in, t.bytes_out)) for broker, t in found]
-    print_table(*_with_brokers(heads, rows), "")
+    print_table(*with_brokers(heads, rows), "")
     for _, trunk in found:
         if trunk.reason:
             click.echo(f"trunk {trunk.name} is {trunk.state}: {printable(trunk.reason)}")
@@ -228,22 +207,9 @@ def show_routes(found: Routes) -> None:
     if on_terminal():
         heads = ("robot", "where", "origin", "heard", "forgotten in")
         rows = [(broker, _route(route)) for broker, route in found]
-        print_table(*_with_brokers(heads, rows), "No robot has been heard yet. Ask who is there: psiu discover")
+        print_table(*with_brokers(heads, rows), "No robot has been heard yet. Ask who is there: psiu discover")
         return
     print_rows((r.robot, r.link, r.peer, r.origin, r.age_s, r.expires_in_s, broker) for broker, r in found)
-
-
-def show_ledger(found: Ledgers, *, drawn: bool) -> None:
-    rows = [(broker, _account(account)) for broker, each in found for account in (*each.accounts, each.total)]
-    if not drawn:
-        print_rows((*row, broker) for broker, row in rows)
-        return
-    heads = ("link", "arrived", "delivered", "answered", "dropped", "waiting", "why dropped")
-    print_table(*_with_brokers(heads, rows), "No frame has arrived yet.")
-    for broker, each in found:
-        sums = "arrived = delivered + answered + dropped + waiting"
-        text = f"The books of {broker} balance: {sums}." if each.balances else f"The books of {broker}: {sums} FAILS."
-        click.echo(styled(text, fg="green" if each.balances else "red"))
 
 
 def show_status(found: Iterable[tuple[Status, Health]]) -> None:
@@ -289,7 +255,7 @@ def _print_each(told: Told) -> None:
     print_json([{"broker": broker, **each} for broker, found in told for each in found])
 
 
-def _with_brokers(columns: Sequence[str], rows: Rows) -> tuple[Sequence[str], Sequence[Sequence[Cell]]]:
+def with_brokers(columns: Sequence[str], rows: Rows) -> tuple[Sequence[str], Sequence[Sequence[Cell]]]:
     """Say in front of every row whose it is, where there are several brokers."""
     if len({broker for broker, _ in rows}) < 2:
         return columns, [row for _, row in rows]
@@ -318,12 +284,6 @@ def _route(route: Route) -> Sequence[Cell]:
 
 def _where(link: str, peer: str | None) -> str:
     return link if peer is None else f"{link}/{peer}"
-
-
-def _account(account: Account) -> Sequence[Cell]:
-    reasons = " ".join(f"{reason}={count}" for reason, count in account.dropped.items())
-    dropped = sum(account.dropped.values())
-    return account.link, account.arrived, account.delivered, account.answered, dropped, account.waiting, reasons
 
 
 _EVERYBODYS: Final = frozenset(command.name for command in QUESTIONS)
