@@ -38,7 +38,9 @@ def test_links_say_what_they_wait_for(lab: Any) -> None:
     assert links["lost"].state in ("waiting", "opening")
     assert "/dev/serial/by-id/none" in str(links["lost"].reason)
     rows = {line.split("\t")[0]: line.split("\t") for line in lab.run("links").stdout.splitlines()}
-    assert {len(row) for row in rows.values()} == {13}
+    assert {len(row) for row in rows.values()} == {15}
+    assert rows["lost"][13:] == ["-", "-"], "nothing was sent"
+    assert [float(ms) for ms in rows["radio"][13:]] == [links["radio"].delay_p50_ms, links["radio"].delay_p99_ms]
     assert "/dev/serial/by-id/none" in rows["lost"][4]
 
 
@@ -99,6 +101,7 @@ def test_a_terminal_gets_tables_with_heads_and_reasons(lab: Any) -> None:
         assert command.wait(10) == 0
     lines = text.decode().splitlines()
     assert "malformed" in lines[0]
+    assert "waited" in lines[0]
     assert any(line.startswith("lost is ") and "/dev/serial/by-id/none" in line for line in lines)
     assert any("far end" in line for line in lines)
     assert re.search(r"trunk hill is (waiting|opening): .*connection refused", lines[-1])
