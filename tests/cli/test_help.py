@@ -50,7 +50,7 @@ def test_the_help_of_every_roboscript_command_has_examples_and_offers_json(tool:
     assert "--json" in shown.output
 
 
-@pytest.mark.parametrize("command", ["run", "check", "schema", "demo"])
+@pytest.mark.parametrize("command", ["run", "check", "schema", "keys", "demo"])
 def test_the_help_of_every_daemon_command_has_examples(daemon: Run, command: str) -> None:
     shown = daemon(command, "--help")
     assert shown.exit_code == 0
@@ -59,7 +59,7 @@ def test_the_help_of_every_daemon_command_has_examples(daemon: Run, command: str
 
 def test_every_command_is_tested_here() -> None:
     assert set(psiu.list_commands(None)) == {*ON_THE_BUS, *ALONE, *GROUPS}  # type: ignore[arg-type]
-    assert set(psiu_broker.list_commands(None)) == {"run", "check", "schema", "demo"}  # type: ignore[arg-type]
+    assert set(psiu_broker.list_commands(None)) == {"run", "check", "schema", "keys", "demo"}  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("module", ["tool", "daemon"])
