@@ -1,0 +1,86 @@
+"""What became of every frame, in tables, plain lines and JSON, once and as it goes."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+from typing import Any
+
+import pytest
+
+from psiu_broker.bus.client import Client
+from psiu_broker.messages import Ledger, RobotAccount
+
+
+def test_robot_by_robot_the_sums_are_those_of_all_links(lab: Any) -> None:
+    lab.run("call", "MNERIM", "parafrente", "1")
+    robots = [RobotAccount.model_validate(each) for each in lab.json("ledger", "--robots")]
+    assert {"MNERIM", "BETA", "BRACO", "base", None} == {each.robot for each in robots}
+    assert {each.robot: each.link for each in robots}["MNERIM"] == "radio"
+    for each in robots:
+        assert each.arrived == each.delivered + each.answered + sum(each.dropped.values()) + each.waiting
+    total = Ledger.model_validate(lab.json("ledger")[0]).total
+    assert sum(each.arrived for each in robots) == total.arrived
+
+
+def test_one_robots_books_are_found_by_its_name(lab: Any) -> None:
+    (line,) = lab.run("ledger", "MNERIM").stdout.splitlines()
+    name, link, arrived, delivered, answered, dropped, waiting, _, broker = line.split("\t")
+    assert (name, link, broker) == ("MNERIM", "radio", "base")
+    assert int(arrived) == int(delivered) + int(answered) + int(dropped) + int(waiting)
+
+
+def test_of_a_robot_that_never_spoke_there_are_no_books(lab: Any) -> None:
+    refused = lab.run("ledger", "GHOST", "--json")
+    assert refused.exit_code == 3
+    assert json.loads(refused.stdout)["error"] == "unknown_robot"
+    assert "psiu ledger --robots" in refused.stderr
+
+
+def test_watched_it_is_told_again_and_again_until_ctrl_c(lab: Any) -> None:
+    watched = subprocess.Popen(
+        [*lab.script("psiu"), "ledger", "--watch", "--json"],
+        stdout=subprocess.PIPE,
+        env={**os.environ, **lab.env, "PYTHONUNBUFFERED": "1"},
+    )
+    with watched:
+        assert watched.stdout is not None
+        looks = [Ledger.model_validate(json.loads(watched.stdout.readline())[0]) for _ in range(3)]
+        watched.send_signal(signal.SIGINT)
+        assert watched.wait(10) == 0
+    assert all(look.balances for look in looks)
+    assert looks[0].total.arrived <= looks[2].total.arrived
+
+
+def test_watched_on_a_terminal_it_says_how_many_come_a_second(lab: Any) -> None:
+    screen, terminal = pty.openpty()
+    with open(screen, "rb", buffering=0) as shown:  # noqa: PTH123
+        command = subprocess.Popen(
+            [*lab.script("psiu"), "ledger", "--watch"], stdout=terminal, env={**os.environ, **lab.env, "COLUMNS": "120"}
+        )
+        os.close(terminal)
+        text = b""
+        while text.count(b"The books of base balance") < 2:
+            text += shown.read(4096)
+        command.send_signal(signal.SIGINT)
+        assert command.wait(10) == 0
+    assert b"a second" in text
+    assert text.startswith(b"\x1b[H\x1b[J"), "each look in the place of the last"
+
+
+def test_books_that_do_not_balance_are_shown_while_watching(lab: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = lab.json("ledger")[0] | {"balances": False}
+    looks = iter(({"base": told}, {"base": told}))
+
+    def ask(*_: object) -> dict[str, Any]:
+        try:
+            return next(looks)
+        except StopIteration:
+            raise KeyboardInterrupt from None
+
+    monkeypatch.setattr(Client, "ask", ask)
+    monkeypatch.setattr("psiu_broker.cli.ledger.EVERY_S", 0.0)
+    result = lab.run("ledger", "--watch", "--json")
+    assert result.exit_code == 0
+    assert [json.loads(line)[0]["balances"] for line in result.stdout.splitlines()] == [False, False]
