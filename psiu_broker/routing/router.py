@@ -15,15 +15,17 @@ from psiu_broker.frame import EVERYONE, MESH, NOBODY, Address, Frame, Way
 from psiu_broker.routing.books import Books
 from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.guard import Guard
-from psiu_broker.routing.outbox import is_stop
+from psiu_broker.routing.outbox import STOP_LANE, is_stop, lane
 from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.policy import Policy, Rule
+from psiu_broker.routing.quarantine import Quarantine
 from psiu_broker.routing.table import Binding, Route, Table
 from psiu_broker.routing.verdicts import (
     DENIED,
     DUPLICATE,
     LINK_DOWN,
     NO_ROUTE,
+    QUARANTINED,
     REFUSED,
     SAME_WAY,
     SPOOFED,
@@ -64,7 +66,7 @@ class Decision:
 DOUBLE: Final = Decision("drop", verdict=DUPLICATE, void=True)
 _TURNED_AWAY: Final[Mapping[Verdict, Decision]] = {
     verdict: Decision("drop", verdict=verdict, void=True)
-    for verdict in (REFUSED, DENIED, SPOOFED, TOO_MANY_NAMES, STORM)
+    for verdict in (REFUSED, DENIED, SPOOFED, TOO_MANY_NAMES, QUARANTINED, STORM)
 }
 _ANSWER: Final = Decision("answer")
 
@@ -120,6 +122,7 @@ class Router:
             route.decision = _ANSWER
             self._routes[address] = route
         self.guard = Guard()
+        self.quarantine = Quarantine()
         self.policy: Policy | None = None
         self.ports: dict[str, Port] = {}
         """The links that are up, and `MESH`."""
@@ -146,7 +149,9 @@ class Router:
         is_there = source is not None and source.way is arrived
         # Before its double is looked for: what is turned away must not stand in the way of what it imitates.
         if not is_there and self._is_spoofed(source, arrived):
-            return self._refuse_spoofed(frame, arrived, now)
+            return self._turn_away_unless_double(frame, SPOOFED, arrived, now)
+        if self.quarantine.held and not is_there and self._is_held_back(frame, source, arrived, now):
+            return self._turn_away_unless_double(frame, QUARANTINED, arrived, now)
         policy = self.policy
         if policy is not None and arrived is not SELF:
             rule = policy.denial(frame, arrived)
@@ -304,11 +309,19 @@ class Router:
             return False
         return source.way is SELF or (arrived.link != MESH and not source.may_be_on(arrived))
 
-    def _refuse_spoofed(self, frame: Frame, arrived: Way, now: float) -> Decision:
+    def _is_held_back(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> bool:
+        """Whether `frame` comes in the name of a robot on another link; a stop passes, whoever says it."""
+        robot = frame.source if source is None else source.robot
+        if lane(frame) == STOP_LANE or not self.quarantine.holds(robot, arrived.link):
+            return False
+        self.quarantine.turned_away(robot, now)
+        return True
+
+    def _turn_away_unless_double(self, frame: Frame, verdict: Verdict, arrived: Way, now: float) -> Decision:
         self.books.arrived(frame.source)
         if self._duplicates.knows(self._identity(frame), arrived, now, frame.subject):
             return DOUBLE  # overheard, or come round
-        return self._turn_away(frame, SPOOFED, arrived, now)
+        return self._turn_away(frame, verdict, arrived, now)
 
     def _turn_away(
         self, frame: Frame, verdict: Verdict, arrived: Way, now: float, rule: Rule | None = None
@@ -337,8 +350,14 @@ class Router:
             return None  # other brokers announce their robots; what these say teaches nothing
         if source is not None and source.way.link == MESH and not self._takes(source, frame, arrived, now):
             return None
-        if source is None and not self._may_come(frame.source, arrived, now):
-            return TOO_MANY_NAMES
+        if self.quarantine.holds(frame.source if source is None else source.robot, arrived.link):
+            return None  # a stop, which teaches nothing
+        if source is None:
+            if not self._may_come(frame.source, arrived, now):
+                return TOO_MANY_NAMES
+        elif source.way.link not in (arrived.link, MESH) and not source.pinned:
+            if self.quarantine.moved(source.robot, source.way.link, arrived.link, now) is not None:
+                return QUARANTINED
         news = source is None or source.way != arrived or source.heard_at is None
         route = self.table.learn(frame.source, arrived, frame.protocol, now)
         if route is not None:
@@ -365,6 +384,8 @@ class Router:
                 source.heard_at = now
             elif source.way.link == MESH and self._ownership is not None and source.may_be_on(arrived):
                 self._ownership.overhear(source, frame, arrived, now)
+            elif source.way.link != arrived.link and source.heard_at is not None:
+                self.quarantine.both_heard(source.robot, now - source.heard_at)
         return DOUBLE
 
     def _is_translatable(self, protocol: str, target: Route, arrived: Way) -> bool:

@@ -16,6 +16,7 @@ Verdict = Literal[
     "denied",
     "spoofed",
     "too_many_names",
+    "quarantined",
     "storm",
     "link_down",
     "malformed",
@@ -45,6 +46,8 @@ SPOOFED: Final = "spoofed"
 """It came from elsewhere than where the configuration says that its source is."""
 TOO_MANY_NAMES: Final = "too_many_names"
 """More names turned up on its link of late than may; its source was one too many."""
+QUARANTINED: Final = "quarantined"
+"""A robot on another link has its source's name, and had it first."""
 STORM: Final = "storm"
 """Too many frames to everyone came from its link of late."""
 LINK_DOWN: Final = "link_down"
