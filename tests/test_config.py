@@ -225,7 +225,7 @@ def test_a_configuration_cannot_be_changed(read):
             "robots.A.nodes.g.sgned: unknown key; did you mean signed?",
             id="node",
         ),
-        pytest.param(BROKER + "[zenoh]\nxyz = 1", "zenoh.xyz: unknown key; known: listen, prefix", id="nothing near"),
+        pytest.param(BROKER + "[zenoh]\nxyz = 1", "zenoh.xyz: unknown key; known: access, listen, prefix, tls, unprotected", id="nothing near"),
         pytest.param(
             BROKER + RADIO + "topology = 1", "links.radio.topology: unknown key; known: adapter,", id="other protocol"
         ),
@@ -513,6 +513,11 @@ def test_a_robot_s_name_is_not_an_address(problems):
             CORPO.replace("mitya", "firmata") + 'role = "host"\nplays = "A"\n' + RADIO + '[robots.A]\nlink="radio"',
             'links.corpo.role: programs find a board there, got "host"; remove it',
             id="a program is told of a robot by another program",
+        ),
+        pytest.param(
+            WIFI + 'peers = ["127.0.0.1:9000"]',
+            "links.wifi.peers[0]: link wifi of this broker listens there, and would hear itself; give where the robot",
+            id="a broker that is its own peer",
         ),
         pytest.param(
             CAMPO + "rate_hz = 300",

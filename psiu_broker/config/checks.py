@@ -84,6 +84,7 @@ def check_devices(
                     text = f"{got(mine)} is taken by {holder} already; give each its own"
                     problems.add((f"{kind}s", name, option), text)
             held.append((option, mine, f"{kind} {name}"))
+    _check_own_ends(links, problems)
     accepting: dict[str, str] = {}
     for kind, name, adapter in users:
         if getattr(adapter, "accept", None) is True:
@@ -91,6 +92,19 @@ def check_devices(
             if (first := accepting.setdefault(controller, f"{kind} {name}")) != f"{kind} {name}":
                 text = f"{first} takes all who call {controller} already; keep one of them"
                 problems.add((f"{kind}s", name, "accept"), text)
+
+
+def _check_own_ends(links: Collection[LinkConfiguration], problems: Problems) -> None:
+    """A broker that is its own peer hears all that it says: for ever, where packets name no sender."""
+    listening = {
+        link.name: listen for link in links if isinstance(listen := getattr(link.adapter, "listen", None), str)
+    }
+    for link in links:
+        for position, peer in enumerate(getattr(link.adapter, "peers", ())):
+            for name, listen in listening.items():
+                if _same("listen", peer, listen):
+                    text = f"link {name} of this broker listens there, and would hear itself; give where the robot is"
+                    problems.add(("links", link.name, "peers", position), text)
 
 
 def _same(option: str, a: str, b: str) -> bool:
