@@ -33,6 +33,7 @@ UDP_LINK = """
 adapter = "udp"
 listen = "127.0.0.1:{port}"
 protocol = "psiu-ascii"
+new_names_per_minute = 100000
 """
 PTY_LINK = """
 [links.{name}]
@@ -41,6 +42,7 @@ device = "{device}"
 baudrate = 4000000
 pace = false
 protocol = "psiu-ascii"
+new_names_per_minute = 100000
 """
 
 
