@@ -11,6 +11,7 @@ from psiu_broker.bus.mesh import ZenohMesh
 from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries, Source
 from psiu_broker.bus.round_trip import RoundTrip
+from psiu_broker.bus.routers import refuse_routers
 from psiu_broker.bus.session import Session, plain
 from psiu_broker.bus.traces import Traces
 from psiu_broker.config import Configuration
@@ -95,6 +96,9 @@ class Bus:
             lost=lambda _: lost(),
         )
         try:
+            if zenoh.access is not None:
+                brokers = zenoh.access.brokers
+                await refuse_routers(session, brokers, trunks=bool(configuration.trunks))
             return cls(
                 session,
                 await Publisher.open(session, keys, name, broker.describe, names(configuration)),

@@ -302,6 +302,29 @@ async def test_brokers_with_keys_are_one_network(tmp_path: Path, mode: str) -> N
             assert lab.robot.position.x == 1
 
 
+@SEVERAL
+async def test_a_program_that_comes_as_a_router_takes_no_broker_out_of_another_s_sight(
+    tmp_path: Path, mode: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with SecureLab(tmp_path, ("base", "hill", "valley"), mode) as lab:
+        await until(lambda: all(len(broker.mesh_seen().brokers) == 2 for broker in lab.brokers))
+        await until(lambda: [each.owner for each in lab.brokers[0].mesh_seen().robots] == ["valley"])
+        # It would be the shorter way from base to valley, where hill relays.
+        config = zenoh_config(lab.endpoints[0], files(lab.keys, "screen"), mode="router")
+        config.insert_json5("connect/endpoints", json.dumps([lab.endpoints[0], lab.endpoints[2]]))
+        rogue = await asyncio.to_thread(zenoh.open, config)
+        try:
+            await until(lambda: len([each for each in caplog.messages if "screen comes as a router" in each]) == 2)
+            with lab.client("operator") as client:
+                for _ in range(20):
+                    answer = await asyncio.to_thread(client.call, "MNERIM", "quantoscomandos")
+                    assert answer.values == [7]
+                    await asyncio.sleep(0.15)  # it comes again and again meanwhile
+            assert [len(broker.mesh_seen().brokers) for broker in lab.brokers] == [2, 2, 2]
+        finally:
+            await asyncio.to_thread(rogue.close)
+
+
 async def test_a_broker_that_is_named_among_no_brokers_is_met_by_none(tmp_path: Path) -> None:
     lab = SecureLab(tmp_path, ("base", "hill", "valley"))
     file = tmp_path / "base.toml"
