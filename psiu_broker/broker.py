@@ -38,7 +38,19 @@ from psiu_broker.mesh.mesh import MAX_AGE_S, Mesh
 from psiu_broker.mesh.neighbour import Neighbours
 from psiu_broker.mesh.probe import Probed
 from psiu_broker.mesh.quality import Qualities
-from psiu_broker.messages import Answer, CallRequest, Card, Health, Ledger, RobotAccount, Route, Status, Trace, Why
+from psiu_broker.messages import (
+    Answer,
+    CallRequest,
+    Card,
+    Conflict,
+    Health,
+    Ledger,
+    RobotAccount,
+    Route,
+    Status,
+    Trace,
+    Why,
+)
 from psiu_broker.messages import Link as LinkMessage
 from psiu_broker.messages import Mesh as MeshMessage
 from psiu_broker.messages import Trunk as TrunkMessage
@@ -115,6 +127,7 @@ class Broker:
         self._last_alive = LastAlive(name) if configuration.mesh.mode == "router" else None
         self._changed: dict[Address, table.Route] = {}
         self._seen: dict[str, float] = {}
+        self._conflicts: set[tuple[str, ...]] = set()
         self._pulse = Pulse(time.monotonic())
         self._bus: Bus | None = None
         self._bus_lost = asyncio.Event()
@@ -223,8 +236,16 @@ class Broker:
         mode, bus = self.configuration.mesh.mode, self._bus
         return self.report.mesh(self.mesh, mode, bus.session.zenoh_id if bus else "", bus.mesh.linked if bus else ())
 
+    def conflicts(self) -> Sequence[Conflict]:
+        return self.report.conflicts(self.mesh)
+
     def why(self, a: Address, b: Address) -> Why:
         return self.report.why(a, b)
+
+    def release(self, robot: Address, link: str) -> bool:
+        """Hold the robot on that link back no longer; False if it is not."""
+        route = self.exchange.router.find(robot)
+        return self.exchange.router.quarantine.release(robot if route is None else route.robot, link)
 
     def robots(self) -> Iterable[Address]:
         return [route.robot for route in self.exchange.router.robots()]
@@ -412,10 +433,25 @@ class Broker:
                 self._seen[link.name] = link.since
                 self._note(route for route in self.exchange.router.robots() if route.way.link == link.name)
         self.mesh.tick(now)
+        self._alarm()
         if self._bus is not None:
             for robot in tuple(self._changed):
                 route = self._changed.pop(robot)  # first: one that cannot be told must not be in the way of the others
                 self._bus.publisher.publish_card(route.robot, self.report.card(route))
+
+    def _alarm(self) -> None:
+        """Say aloud, once, which names are not one robot's."""
+        conflicts = self.conflicts()
+        now = {(each.robot, *each.brokers, *each.held_back): each for each in conflicts}
+        if now.keys() == self._conflicts:
+            return
+        for key in now.keys() - self._conflicts:
+            log.warning("more than one is called %s: %s", now[key].robot, now[key].detail)
+        for name, *_ in self._conflicts - now.keys():
+            log.info("%s: what was said of its name is no longer so", name)
+        self._conflicts = set(now)
+        if self._bus is not None:
+            self._bus.publisher.publish_conflicts(conflicts)
 
     def _checks(self) -> dict[str, bool]:
         links = {task.get_name(): not task.done() for task in self._link_tasks}

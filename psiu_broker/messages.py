@@ -299,12 +299,21 @@ class MeshRobot(Message):
 
 
 class Conflict(Message):
-    """One name that more than one robot, or broker, seems to have."""
+    """One name that more than one robot, or broker, seems to have: ``psiu/@broker/{broker}/conflicts``, put on change.
+
+    Robots of one name are at several brokers, or on several links of one: `link` has the name then.
+    """
 
     robot: str
     brokers: list[str]
     since: Moment
     detail: str = Field(description="what it means, and what to do")
+    link: str | None = Field(default=None, description="which link keeps the name; null: it is among brokers")
+    held_back: list[str] = Field(
+        default=[], description="the links where whoever has the name too is neither listened to nor commanded"
+    )
+    frames: int = Field(default=0, description="how many frames were turned away there")
+    last: Moment | None = Field(default=None, description="when the last of them was")
 
 
 class Mesh(Message):
@@ -362,6 +371,7 @@ PUBLISHED: Final[tuple[type[Message], ...]] = (
     Health,
     Why,
     Mesh,
+    Conflict,
     Trace,
 )
 """The messages of the bus, in the order in which `psiu schema` prints them."""

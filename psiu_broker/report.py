@@ -30,6 +30,7 @@ from psiu_broker.routing.books import Told
 from psiu_broker.routing.claims import BEST
 from psiu_broker.routing.guard import Refusal
 from psiu_broker.routing.policy import Rule
+from psiu_broker.routing.quarantine import Held
 from psiu_broker.routing.router import SELF, Decision
 from psiu_broker.trunk import Trunk
 
@@ -156,9 +157,31 @@ class Report:
             zenoh_id=zenoh_id,
             brokers=sorted(brokers, key=lambda broker: broker.name),
             robots=sorted(robots, key=lambda robot: robot.robot),
-            conflicts=[self._conflict(*each) for each in mesh.conflicts(now)],
+            conflicts=self._mesh_conflicts(mesh, now),
             redeclared=mesh.declared_anew,
         )
+
+    def conflicts(self, mesh: Mesh) -> list[Conflict]:
+        """Every name that is not one robot's, by name: on the links of this broker, and among brokers."""
+        here = [self._held(each) for each in self._router.quarantine]
+        return sorted(here + self._mesh_conflicts(mesh, self._clock()), key=lambda each: each.robot)
+
+    def _held(self, held: Held) -> Conflict:
+        links = ", ".join(sorted(held.links))
+        return Conflict(
+            robot=str(held.robot),
+            brokers=[self._broker],
+            since=self.moment(held.since),
+            detail=f"{held.keeper} has the name, {links} is held back: rename that one, or let it in: "
+            f"psiu conflicts --release {held.robot} {sorted(held.links)[0]}",
+            link=held.keeper,
+            held_back=sorted(held.links),
+            frames=held.frames,
+            last=self.moment(held.last),
+        )
+
+    def _mesh_conflicts(self, mesh: Mesh, now: float) -> list[Conflict]:
+        return [self._conflict(*each) for each in mesh.conflicts(now)]
 
     def _conflict(self, name: str, brokers: Iterable[str], since: float, detail: str) -> Conflict:
         return Conflict(robot=name, brokers=sorted(brokers), since=self.moment(since), detail=detail)
@@ -372,6 +395,7 @@ _REASONS = {
     "link_down": "its link is down",
     "refused": "it speaks another protocol, and there is no translation",
     "too_many_names": "more new names than new_names_per_minute came on that link",
+    "quarantined": "a robot on another link has that name: psiu conflicts",
     "storm": "too many frames to everyone came from that link",
 }
 

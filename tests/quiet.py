@@ -6,7 +6,20 @@ from typing import Any, Final
 
 from psiu_broker.bus.queries import Source
 from psiu_broker.frame import Address
-from psiu_broker.messages import Account, Card, Health, Ledger, Link, Mesh, RobotAccount, Route, Status, Trunk, Why
+from psiu_broker.messages import (
+    Account,
+    Card,
+    Conflict,
+    Health,
+    Ledger,
+    Link,
+    Mesh,
+    RobotAccount,
+    Route,
+    Status,
+    Trunk,
+    Why,
+)
 
 NOW: Final = datetime(2026, 11, 22, tzinfo=UTC)
 
@@ -47,6 +60,12 @@ class Quiet(Source):
 
     def mesh_seen(self) -> Mesh:
         return Mesh(broker="base", mode="peer", zenoh_id="b")
+
+    def conflicts(self) -> Sequence[Conflict]:
+        return []
+
+    def release(self, robot: Address, link: str) -> bool:
+        return False
 
     def config(self) -> Mapping[str, Any]:
         return {"broker": {"name": "base"}}

@@ -10,12 +10,12 @@ from typing import Final
 
 from psiu_broker.config.tables import AccessConfiguration, ZenohConfiguration
 
-HEARD: Final = ("**", "@raw/**")
+HEARD: Final = ("**", "@raw/**", "@broker/*/conflicts")
 """What listeners and commanders may subscribe to."""
 
 ASKED: Final = ("*", "@broker/*/*", "@broker/*/why/*/*")
 """What listeners and commanders may get. Every ``@broker/{broker}/{word}`` must be harmless: whatever makes a broker
-or a robot do anything has another chunk, as ``trace/{a}/{b}`` has."""
+or a robot do anything has another chunk, as ``trace/{a}/{b}`` and ``release/{robot}/{link}`` have."""
 
 COMMANDED: Final = ("@call/*/*", "@broker/**")
 """What commanders may get besides; and put, of `CALLS`."""

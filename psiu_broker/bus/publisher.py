@@ -1,19 +1,20 @@
 """What robots say, told to the programs that listen; nothing is decoded for nobody."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
+from pydantic_core import to_json
 
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.session import Session, aside, json_of
 from psiu_broker.errors import BusError
 from psiu_broker.frame import Address, Frame, Way
-from psiu_broker.messages import Card, Decoded, RawFrame
+from psiu_broker.messages import Card, Conflict, Decoded, RawFrame
 
 Describe = Callable[[Frame], Mapping[str, Any]]
 """The fields of `Decoded` that depend on the protocol: kind, command, parameters, status, …"""
@@ -29,6 +30,7 @@ PRIORITY: Final = zenoh.Priority.DATA_LOW
 _DECODED: Final = json_of("Decoded")
 _RAW: Final = json_of("RawFrame")
 _CARD: Final = json_of("Card")
+_CONFLICTS: Final = json_of("Conflict[]")
 
 
 class Publisher:
@@ -116,6 +118,20 @@ class Publisher:
                 priority=PRIORITY,
             )
             self._cards[robot] = payload
+            self.puts += 1
+        except BaseException as error:
+            self._failed(error)
+
+    def publish_conflicts(self, conflicts: Sequence[Conflict]) -> None:
+        """Put the names that are not one robot's, all that there are now."""
+        try:
+            self._session.zenoh.put(
+                self._keys.broker(self._broker, "conflicts"),
+                to_json(conflicts),
+                encoding=_CONFLICTS,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=PRIORITY,
+            )
             self.puts += 1
         except BaseException as error:
             self._failed(error)

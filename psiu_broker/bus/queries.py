@@ -7,12 +7,12 @@ from typing import Any, Final, Protocol
 
 import zenoh
 
-from psiu_broker.bus.keys import Keys, robot
+from psiu_broker.bus.keys import Keys, robot, text
 from psiu_broker.bus.replies import Replies, Values
 from psiu_broker.bus.session import JSON, Session, json_of
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
-from psiu_broker.messages import Card, Health, Ledger, Link, Mesh, RobotAccount, Route, Status, Trunk, Why
+from psiu_broker.messages import Card, Conflict, Health, Ledger, Link, Mesh, RobotAccount, Route, Status, Trunk, Why
 
 logger = logging.getLogger(__name__)
 
@@ -36,8 +36,10 @@ class Source(Protocol):
     def robot_accounts(self) -> Sequence[RobotAccount]: ...
     def health(self) -> Health: ...
     def mesh_seen(self) -> Mesh: ...
+    def conflicts(self) -> Sequence[Conflict]: ...
     def config(self) -> Mapping[str, Any]: ...
     def why(self, a: Address, b: Address) -> Why: ...
+    def release(self, robot: Address, link: str) -> bool: ...
     def robots(self) -> Iterable[Address]: ...
     def card(self, robot: Address) -> Card | None: ...
 
@@ -46,7 +48,8 @@ class Queries:
     """Answers ``psiu/@broker/{broker}/…`` and ``psiu/{robot}``; lists are JSON arrays.
 
     A query with wildcards gets every answer that it covers, each on its own key, except
-    ``why/{a}/{b}``, which must name two robots.
+    ``why/{a}/{b}``, which must name two robots, and ``release/{robot}/{link}``, after which the
+    robot on that link is no longer held back: its answer is what conflicts are left.
     """
 
     def __init__(self, session: Session, keys: Keys, broker: str, source: Source) -> None:
@@ -65,6 +68,7 @@ class Queries:
             keys.broker(broker, "ledger-of-robots"): (json_of("RobotAccount[]"), source.robot_accounts),
             keys.broker(broker, "health"): (json_of("Health"), source.health),
             keys.broker(broker, "mesh"): (json_of("Mesh"), source.mesh_seen),
+            keys.broker(broker, "conflicts"): (json_of("Conflict[]"), source.conflicts),
             keys.broker(broker, "config"): (JSON, source.config),
         }
 
@@ -116,13 +120,23 @@ class Queries:
             _, what = self._keys.read_broker(str(asked))
             if what[:1] == ["trace"] and len(what) == 3:
                 return {}  # `Traces` answers
+            if what[:1] == ["release"] and len(what) == 3 and "*" not in "".join(what):
+                return self._release("/".join(what[1:]), robot(what[1]), text(what[2]))
             pair = [robot(each) for each in what[1:]] if what[:1] == ["why"] and "*" not in "".join(what) else []
         except ValueError as error:
             raise CallError("bad_request", str(error)) from error
         if len(pair) == 2:
             key = "/".join((self._keys.broker(self._broker, "why"), *what[1:]))
             return {key: (json_of("Why"), self._source.why(*pair))}
-        raise CallError("bad_request", f"{asked} is none of {', '.join(self._tables)}, why/A/B and trace/A/B")
+        raise CallError(
+            "bad_request", f"{asked} is none of {', '.join(self._tables)}, why/A/B, trace/A/B and release/A/LINK"
+        )
+
+    def _release(self, chunks: str, which: Address, link: str) -> Values:
+        if not self._source.release(which, link):
+            raise CallError("bad_request", f"no {which} is held back on {link}: psiu conflicts lists who is")
+        key = f"{self._keys.broker(self._broker, 'release')}/{chunks}"
+        return {key: (json_of("Conflict[]"), self._source.conflicts())}
 
     def _card_values(self, asked: zenoh.KeyExpr) -> Values:
         key = str(asked)

@@ -23,6 +23,7 @@ _HERE: Final = "psiu_broker.cli"
         "why": ("Tell what would become of a frame from A to B.", f"{_HERE}.paths:why"),
         "trace": ("Have B asked something harmless, and show the way.", f"{_HERE}.paths:trace"),
         "mesh": ("Show the brokers, what is between them, and who owns which robot.", f"{_HERE}.mesh:mesh"),
+        "conflicts": ("List the names that more than one robot has.", f"{_HERE}.conflicts:conflicts"),
         "ledger": ("Show the fate of every frame.", f"{_HERE}.ledger:ledger"),
         "status": ("Show how the broker is.", f"{_HERE}.tables:status"),
         "decode": ("Decode bytes into frames.", f"{_HERE}.decode:decode"),

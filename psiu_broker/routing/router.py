@@ -355,9 +355,8 @@ class Router:
         if source is None:
             if not self._may_come(frame.source, arrived, now):
                 return TOO_MANY_NAMES
-        elif source.way.link not in (arrived.link, MESH) and not source.pinned:
-            if self.quarantine.moved(source.robot, source.way.link, arrived.link, now) is not None:
-                return QUARANTINED
+        elif self._is_newcomer(source, arrived, now):
+            return QUARANTINED
         news = source is None or source.way != arrived or source.heard_at is None
         route = self.table.learn(frame.source, arrived, frame.protocol, now)
         if route is not None:
@@ -365,6 +364,13 @@ class Router:
             if news:
                 self._heard(route)
         return None
+
+    def _is_newcomer(self, source: Route, arrived: Way, now: float) -> bool:
+        """Whether who speaks on `arrived` has but the name of a robot that is on another link of ours."""
+        before = source.way.link
+        if before in (arrived.link, MESH) or source.pinned:
+            return False
+        return self.quarantine.moved(source.robot, before, arrived.link, now) is not None
 
     def _may_come(self, robot: Address, arrived: Way, now: float) -> bool:
         """Whether `robot` may be known from now on; one that was there before its link went down is no news."""

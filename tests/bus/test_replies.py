@@ -115,7 +115,18 @@ async def test_the_thread_that_reads_queries_never_waits_for_one(
     session: Session, keys: Keys, stuck: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(queries_module, "AT_ONCE_MAX", 0)
-    tables = ("status", "links", "trunks", "routes", "ledger", "robot_accounts", "health", "mesh_seen", "config")
+    tables = (
+        "status",
+        "links",
+        "trunks",
+        "routes",
+        "ledger",
+        "robot_accounts",
+        "health",
+        "mesh_seen",
+        "conflicts",
+        "config",
+    )
     source: Any = type("Source", (), dict.fromkeys(tables))
     queries = await Queries.open(session, keys, "base", source)
     assert await off_loop(queries._sift, stuck) is None

@@ -24,6 +24,7 @@ ON_THE_BUS = (
     "why",
     "trace",
     "mesh",
+    "conflicts",
     "ledger",
     "status",
 )
