@@ -38,6 +38,7 @@ baudrate = 115200
 protocol = "{protocol}"
 route_age_s = {route_age_s}
 max_age_s = {max_age_s}
+question_max_age_s = {max_age_s}
 """
 
 
