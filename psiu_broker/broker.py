@@ -116,6 +116,7 @@ class Broker:
         self.exchange.join(self.mesh, MAX_AGE_S)
         self.resident = self.exchange.resident = Resident(configuration, self.exchange)
         self.resident.settling(lambda: SETTLING_S if neighbours.ways else 0.0)
+        self.programs = self.resident.failsafe
         self.tracing = Tracing(name, self.exchange, self.resident.call, self._broker_of)
         self._trunks = Trunks(name, configuration.trunks.values())
         self.report = Report(name, self.exchange, self.resident.commands, self._trunks)
@@ -427,6 +428,7 @@ class Broker:
         if stood_still_s:
             log.warning("stood still for %.1f s; calls that came meanwhile are refused", stood_still_s)
         self.exchange.expire(now)
+        self.resident.failsafe.tick(now)
         for link in self.exchange.links.values():
             self._qualities.count(link.name, link.frames_in, link.malformed)
             if self._seen.get(link.name) != link.since:

@@ -11,9 +11,11 @@ from typing import Any, Final, NamedTuple
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
 from psiu_broker.config import Configuration
+from psiu_broker.config.tables import FailsafeConfiguration
 from psiu_broker.conversation import Conversations, Robot, Traffic
 from psiu_broker.errors import CallCode, CallError
 from psiu_broker.exchange import Exchange
+from psiu_broker.failsafe import Failsafe
 from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
 from psiu_broker.messages import Answer, CallRequest, Command
 from psiu_broker.profiles import Description, Profile, PsiuProfile, Request
@@ -40,6 +42,7 @@ COMMANDS_ASKED: Final = 64
 GREETINGS_AT_ONCE: Final = 8
 GREET_EVERY_S: Final = 1.0
 """In the long run, for one robot that wants to be greeted without end."""
+_PLAIN: Final = CallRequest()
 _MOMENT_S: Final = 0.001
 """An outbox reads its clock a moment after a call does."""
 
@@ -88,6 +91,7 @@ class Calling:
         self._greetings = Rarely()
         self._greeted_later: set[Address] = set()
         self._ungreeted: set[Address] = set()
+        self.failsafe = Failsafe(configuration, self._stop, self._profile_of, self._heard_at, clock)
         self.settling_s: Callable[[], float] = lambda: 0.0
         """How long another broker may take to say that it heard a robot, too, that was searched for."""
 
@@ -116,7 +120,8 @@ class Calling:
         if timeout_s is not None:
             timeout_s -= asyncio.get_running_loop().time() - begun
         fresh_s = inf if asked_at is None else self._fresh_s(route, command, asked_at)
-        return await self.ask(route, command, request.parameters, timeout_s, fresh_s, by)
+        request = request.model_copy(update={"timeout_s": timeout_s})
+        return await self.ask(route, command, request, fresh_s, by)
 
     async def tell(
         self,
@@ -143,14 +148,14 @@ class Calling:
         fresh_s = self._fresh_s(route, command, asked_at)
         if request.timeout_s is not None:
             fresh_s = min(fresh_s, request.timeout_s - (asyncio.get_running_loop().time() - begun))
-        await self.conversations.tell(self._robot(route), command, request.parameters, fresh_s=fresh_s)
+        robot_there = self._robot(route, request.program)
+        await self.conversations.tell(robot_there, command, request.parameters, fresh_s=fresh_s)
 
     async def ask(
         self,
         route: Route,
         command: str,
-        parameters: Sequence[Any] = (),
-        timeout_s: float | None = None,
+        request: CallRequest = _PLAIN,
         fresh_s: float = inf,
         by: Caller | None = None,
     ) -> Answer:
@@ -164,20 +169,21 @@ class Calling:
         link = self._exchange.links[route.way.link]
         if link.state != "open":
             raise CallError("link_down", f"{route.robot} is on link {link.name}, which is {link.state}: {link.reason}")
-        told = _listing(command, parameters, route, self.commands(route))
+        told = _listing(command, request.parameters, route, self.commands(route))
         if told is not None and route.protocol != psiu_ascii.PROTOCOL:
             return told
-        self._permit(route, command, parameters, by)
-        options = link.configuration.options
+        self._permit(route, command, request.parameters, by)
+        options, configured = link.configuration.options, self._robots.get(route.robot)
         try:
             return await self.conversations.call(
-                self._robot(route),
+                self._robot(route, request.program),
                 command,
-                parameters,
-                timeout_s=timeout_s,
+                request.parameters,
+                timeout_s=request.timeout_s,
                 fresh_s=fresh_s,
-                retries=options.retries,
+                retries=options.retries if request.retries is None else request.retries,
                 busy_poll_s=options.busy_poll_s,
+                repeatable=configured is not None and command in configured.repeatable,
             )
         finally:
             if route.robot in self._ungreeted:
@@ -199,7 +205,8 @@ class Calling:
             log.exception("greeting %s", robot.name)
             return
         for request in greeting:
-            self._exchange.send(robot.build(request), self._clock())
+            # A greeting moves nobody, whatever it looks like.
+            self._exchange.send(robot.build(request._replace(question=True)), self._clock())
 
     def greet_again(self, route: Route) -> None:
         """As `greet`, because of what was heard of the robot: at once, but later where that comes again and again."""
@@ -305,17 +312,23 @@ class Calling:
         reason = f" ({link.reason})" if verdict == LINK_DOWN and link is not None and link.reason else ""
         return CallError(code, f"{robot}: {text}{reason}")
 
-    def _robot(self, route: Route) -> Robot:
-        """Who we are to the robot, who it is to us, and how a request becomes a frame between us."""
+    def _robot(self, route: Route, program: str | None = None) -> Robot:
+        """Who we are to the robot, who it is to us, and how a request, of `program`'s, becomes a frame between us."""
         name, profile, way = str(route.robot), self._profile(route), route.way
         codec = self._exchange.links[way.link].configuration.codec
         own = Address.numbered(codec.local, codec.domain) if isinstance(codec, PsiuHexa.Options) else self.name
         address = next((each for each in route.addresses if each.is_numbered), route.robot)
 
+        ward = self.failsafe.ward(route.robot)
+
         def build(request: Request) -> Frame:
             if route.protocol == psiu_ascii.PROTOCOL:
-                return psiu_ascii.message(own, address, *request.payload.decode("ascii").split(" "))
-            return Frame(own, address, request.subject, request.payload, route.protocol)
+                frame = psiu_ascii.message(own, address, *request.payload.decode("ascii").split(" "))
+            else:
+                frame = Frame(own, address, request.subject, request.payload, route.protocol)
+            if ward is not None:
+                self.failsafe.offered(ward, frame, request, program)
+            return frame
 
         return Robot(name, own, address, profile, build, way.link, way.peer)
 
@@ -325,6 +338,30 @@ class Calling:
         if profile is None or profile.protocol != route.protocol:
             profile = self._profiles[route.robot] = self._make_profile(route)
         return profile
+
+    def _profile_of(self, robot: Address) -> Profile | None:
+        route = self._router.find(robot)
+        return None if route is None or route.way.link in (MESH, SELF.link) else self._profile(route)
+
+    def _heard_at(self, robot: Address) -> float | None:
+        route = self._router.find(robot)
+        return None if route is None else route.heard_at
+
+    async def _stop(self, robot: Address, options: FailsafeConfiguration, timeout_s: float) -> Answer:
+        """As `failsafe.Stop`."""
+        route = self._router.find(robot)
+        if route is None or route.way.link in (MESH, SELF.link):
+            raise CallError("unknown_robot", f"{robot} is no robot of this broker now")
+        link = self._exchange.links[route.way.link]
+        if link.state != "open":
+            raise CallError("link_down", f"link {link.name} is {link.state}: {link.reason}")
+        return await self.conversations.stop(
+            self._robot(route),
+            options.command,
+            options.parameters,
+            timeout_s=timeout_s,
+            retries=link.configuration.options.retries,
+        )
 
     def _make_profile(self, route: Route) -> Profile:
         link = self._exchange.links[route.way.link].configuration
@@ -421,7 +458,7 @@ class Calling:
             count = await self.ask(route, COUNT)
             total = next((value for value in count.values if isinstance(value, int)), 0)
             for index in range(1, min(total, COMMANDS_ASKED) + 1):
-                shown = await self.ask(route, SHOW, [index])
+                shown = await self.ask(route, SHOW, CallRequest(parameters=[index]))
                 command = listed(shown.values)
                 if command is not None:
                     profile.learn_command(command)

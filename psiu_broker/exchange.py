@@ -29,6 +29,7 @@ from psiu_broker.routing.verdicts import (
     NO_ROUTE,
     REFUSED,
     SAME_WAY,
+    UNREACHED,
     Account,
     Verdict,
 )
@@ -90,6 +91,9 @@ class Resident(Protocol):
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         """A frame of the broker's own that waited was dropped."""
 
+    def unreachable(self, frame: Frame, way: Way, now: float) -> None:
+        """A frame that came by `way`, where senders are to be told, did not reach its robot."""
+
     def link_opened(self, link: Link, now: float) -> None: ...
 
     def link_closed(self, link: Link, now: float) -> None: ...
@@ -143,6 +147,8 @@ class Exchange:
         self._route_age_s: dict[str, float] = {}
         self._max_age_s: dict[str, tuple[float, float]] = {}
         """Of what moves robots, and of questions."""
+        self._proxied: set[str] = set()
+        """The links whose senders are told of it in the robot's stead."""
         self._own_name = own_name
         self._wall_clock = wall_clock
 
@@ -152,6 +158,8 @@ class Exchange:
         self.accounts[link.name] = Account()
         self.allowances[link.name] = Allowance(link.adapter.bits_per_second)
         options = link.configuration.options
+        if options.proxy_errors:
+            self._proxied.add(link.name)
         self._ports[link.name] = Port(
             link.name,
             link.configuration.protocol,
@@ -196,6 +204,8 @@ class Exchange:
                 self.router.books.settled(frame.source, verdict)
             if bus.raw_listened:
                 self._tap("in", way, verdict, frame)
+            if self._proxied and verdict in UNREACHED and way.link in self._proxied:
+                self.resident.unreachable(frame, way, now)
         return verdict
 
     def relayed(self, frame: Frame, way: Way, now: float, age_s: float) -> Verdict | None:
@@ -286,6 +296,8 @@ class Exchange:
                 self._tap("in", fate.arrived, final, fate.frame)
             if final is not DELIVERED and fate.arrived is SELF:
                 self.resident.undelivered(fate.frame, final)
+            elif final in UNREACHED and fate.arrived.link in self._proxied:
+                self.resident.unreachable(fate.frame, fate.arrived, now)
 
     def sent(self, frame: Frame, wire: bytes, way: Way) -> None:
         self._tap("out", way, DELIVERED, frame._replace(wire=wire))

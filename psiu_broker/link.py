@@ -39,6 +39,16 @@ class Tap(Protocol):
     raw_listened: bool
 
 
+class Watch(Protocol):
+    """Who watches over robots on a link. None of these waits or raises."""
+
+    def stops(self, frame: Frame) -> bool:
+        """Whether `frame` stops its robot, though its word may be that of any command."""
+
+    def left(self, link: str, frame: Frame, now: float) -> None:
+        """`frame` has left on that link."""
+
+
 class Hub(Protocol):
     """Where links meet: the broker's side of each of them. None of these waits or raises."""
 
@@ -109,6 +119,7 @@ class Link(Kept):
         self.delays = Delays()
         """How long what left had waited; by `frames_out`."""
         self._ends_named = None if self.codec.addressed else ends
+        self.watch: Watch | None = None
         self._askers = Askers() if unaddressed or self._ends_named is not None else None
         self._make_codec = codec
         self._in_pieces = configuration.adapter.datagrams and type(self.codec).pieces is not Codec.pieces
@@ -257,7 +268,7 @@ class Link(Kept):
     # Inside.
 
     def _parcel(self, frame: Frame, wire: bytes, peer: Peer, now: float, patience_s: float, fate: Fate) -> Parcel:
-        urgency = lane(frame)
+        urgency = STOP_LANE if self.watch is not None and self.watch.stops(frame) else lane(frame)
         longest_s = self._question_max_age_s if urgency == QUESTION_LANE else self._max_age_s
         limit = None if self._limits is None else self._limits.of(frame.subject)
         key: Hashable = None
@@ -321,6 +332,8 @@ class Link(Kept):
     def _sent(self, frame: Frame, wire: bytes, peer: Peer, now: float) -> None:
         self.frames_out += 1
         self.last_sent = now
+        if self.watch is not None:
+            self.watch.left(self.name, frame, now)
         if self._askers is not None:
             self._askers.note(frame.destination, frame.source, now)
         if self._hub.bus.raw_listened:

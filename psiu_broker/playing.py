@@ -16,6 +16,7 @@ from psiu_broker.config import Configuration
 from psiu_broker.config.who import Ends, ends
 from psiu_broker.errors import CallError
 from psiu_broker.exchange import Exchange
+from psiu_broker.failsafe import Failsafe
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest
@@ -58,10 +59,12 @@ class Playing:
         configuration: Configuration,
         exchange: Exchange,
         robots: Robots,
+        failsafe: Failsafe,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._exchange = exchange
         self._robots = robots
+        self._failsafe = failsafe
         self._clock = clock
         self._played: Mapping[str, Ends] = {
             name: ends(configuration, link) for name, link in configuration.links.items() if link.options.plays
@@ -131,12 +134,20 @@ class Playing:
             self._robots,
             self._clock,
         )
+        self._failsafe.program_came(_id(way))
         program.open(now)
         return program
 
     def _forget(self, ways: Iterable[Way]) -> None:
         for way in ways:
             self._programs.pop(way).end()
+            if not self._closed:
+                self._failsafe.program_gone(_id(way))
+
+
+def _id(way: Way) -> str:
+    """No program on the bus may be called so."""
+    return f"@{way}"
 
 
 class _Asked(NamedTuple):
@@ -167,6 +178,7 @@ class Program:
         self._address = address
         self._protocol = protocol
         self._caller = Caller(address, way)
+        self._id = _id(way)
         self._send = send
         self._robots = robots
         self._clock = clock
@@ -278,7 +290,7 @@ class Program:
     async def _carry_out(self, asked: _Asked, *, waits: bool) -> None:
         call, answer, error = asked.call, None, ""
         try:
-            request = CallRequest(parameters=list(call.parameters))
+            request = CallRequest(parameters=list(call.parameters)).model_copy(update={"program": self._id})
             if waits:
                 answer = await self._robots.call(self.robot, call.command, request, asked.at, self._caller)
             else:

@@ -17,11 +17,11 @@ from psiu_broker.errors import CallError
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import COMPLAINT, EVERYONE, Address, Frame, Malformed, Way
 from psiu_broker.link import Link
-from psiu_broker.messages import Answer, CallRequest, Command
+from psiu_broker.messages import Answer, CallRequest, Command, Value
 from psiu_broker.playing import Playing
 from psiu_broker.profiles import Description, Responder
 from psiu_broker.profiles.hexa import NAK
-from psiu_broker.profiles.psiu import NAME, said
+from psiu_broker.profiles.psiu import NAME, canonical, said
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.profiles.responder import outcome, refusal
 from psiu_broker.routing.table import Route
@@ -61,7 +61,8 @@ class Resident:
         self._clock = clock
         self._calling = Calling(configuration, exchange, clock)
         self._conversations = self._calling.conversations
-        self._playing = Playing(configuration, exchange, self._calling, clock)
+        self.failsafe = self._calling.failsafe
+        self._playing = Playing(configuration, exchange, self._calling, self.failsafe, clock)
         self._describe = describer(configuration)
         self._responder = Responder(configuration.broker.name)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -125,9 +126,21 @@ class Resident:
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
         self._calling.undelivered(frame, verdict)
 
+    def unreachable(self, frame: Frame, way: Way, now: float) -> None:
+        words, source = said(frame), self._router.find(frame.source)
+        asks = not words.answer and canonical(words.command) != NAME  # the name of one who is absent is nobody's
+        if frame.protocol != psiu_ascii.PROTOCOL or frame.destination == EVERYONE or not asks:
+            return
+        told = self._responder.refused(frame, str(frame.destination), now)
+        if told is not None and source is not None and source.way == way:
+            self._exchange.send_by(told, way, now)
+
     def link_opened(self, link: Link, now: float) -> None:
         """Greet, as far as our allowance on the link goes: robots are to be known before anybody needs them."""
         options = link.configuration.options
+        if link.name in self.failsafe.links:
+            link.watch = self.failsafe
+            self.failsafe.link_opened(link.name)
         self._playing.link_opened(link, now)
         if not options.greet or options.plays is not None:
             return
@@ -146,6 +159,7 @@ class Resident:
                 self._start(self._greet(route))
 
     def link_closed(self, link: Link, now: float) -> None:
+        self.failsafe.link_closed(link.name)
         self._playing.link_closed(link.name)
         self._conversations.link_down(link.name, link.reason or "closed")
 
@@ -188,12 +202,14 @@ class Resident:
         await self._calling.tell(robot, command, request)
 
     async def close(self) -> None:
-        """End every call, and wait for what the broker itself was asking."""
+        """End every call, wait for what the broker itself was asking, and stop the robots that are to be stopped."""
         self._conversations.close()
         await self._playing.close()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._exchange.alone = self.failsafe.last  # robots that command others still speak
+        await self.failsafe.close()
 
     # Inside.
 
@@ -271,7 +287,9 @@ class Resident:
         longest_s = self._exchange.links[route.way.link].configuration.options.longest_wait_s(word)
         fresh_s = longest_s - (self._clock() - arrived)
         try:
-            answer = await self._calling.ask(route, word, words, fresh_s=fresh_s, by=Caller(frame.source, way))
+            # A robot may send more words than a program may parameters.
+            request = CallRequest.model_construct(parameters=list[Value](words))
+            answer = await self._calling.ask(route, word, request, fresh_s, Caller(frame.source, way))
         except CallError as error:
             log.debug("%s told %s %s: %s", frame.source, name, word, error)
             told = self._responder.refused(frame, name, self._clock())

@@ -23,7 +23,7 @@ from psiu_broker.config import (
     ZenohConfiguration,
     load,
 )
-from psiu_broker.config.tables import RobotTable
+from psiu_broker.config.tables import FailsafeConfiguration, RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
 from psiu_broker.protocols import PROTOCOLS
@@ -37,6 +37,7 @@ GROUPS: dict[str, click.Group] = {"psiu": tool.psiu, "psiu-broker": daemon.psiu_
 
 MANY_BROKERS = re.compile(r"^## (?:Many|Muitos) brokers\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 PROTOCOLS_TOLD = re.compile(r"^## (?:Protocols|Protocolos)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+FAILSAFE_TOLD = re.compile(r"^## (?:When nobody is left|Quando não sobra ninguém)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 RIGHTS_TOLD = re.compile(r"^## (?:Who may do what|Quem pode o quê)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MODELS: dict[str, type[BaseModel]] = {
@@ -47,6 +48,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "[mesh]": MeshConfiguration,
     "[links.NAME]": LinkOptions,
     "[robots.NAME]": RobotTable,
+    "[robots.NAME.failsafe]": FailsafeConfiguration,
     **{f'adapter = "{name}"': adapter_class(name) for name in ("serial", "udp", "rfcomm", "pty")},
 }
 
@@ -102,8 +104,10 @@ def test_both_languages_have_the_same_sections_examples_and_tables() -> None:
 @READMES
 def test_ten_minutes_of_reading(readme: str) -> None:
     [many], [protocols] = MANY_BROKERS.findall(readme), PROTOCOLS_TOLD.findall(readme)
-    [rights] = RIGHTS_TOLD.findall(readme)
-    assert _words(readme) - _words(many) - _words(protocols) - _words(rights) <= 2300
+    [rights], [failsafe] = RIGHTS_TOLD.findall(readme), FAILSAFE_TOLD.findall(readme)
+    apart = sum(map(_words, (many, protocols, rights, failsafe)))
+    assert _words(readme) - apart <= 2300
+    assert _words(failsafe) <= 170
     assert _words(rights) <= 200
     assert _words(many) <= 650
     assert _words(protocols) <= 600

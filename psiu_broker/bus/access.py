@@ -22,7 +22,10 @@ COMMANDED: Final = ("@call/*/*", "@broker/**")
 
 CALLS: Final = ("@call/*/*",)
 
-EVERYTHING: Final = ("**", "@alive/**", "@broker/**", "@call/**", "@mesh/**", "@raw/**")
+PROGRAMS: Final = ("@program/**",)
+"""By what commanders are missed when they are gone."""
+
+EVERYTHING: Final = ("**", "@alive/**", "@broker/**", "@call/**", "@mesh/**", "@program/**", "@raw/**")
 """All keys that brokers have: ``**`` covers none with an @."""
 
 TRUNKS: Final = "unixsock-stream"
@@ -97,3 +100,4 @@ def _rules(prefix: str) -> Iterable[Rule]:
     yield allow("commander-asks", "ingress", _ASKING, COMMANDED)
     yield allow("commander-is-answered", "egress", (*_ANSWERING, *_HEARING), COMMANDED)
     yield allow("commander-puts", "ingress", ("put",), CALLS)
+    yield allow("commander-is-there", "ingress", ("liveliness_token",), PROGRAMS)

@@ -8,6 +8,7 @@ from psiu_broker.bus.access import access_control
 from psiu_broker.bus.calls import Calls
 from psiu_broker.bus.keys import Keys
 from psiu_broker.bus.mesh import ZenohMesh
+from psiu_broker.bus.programs import Programs, watch
 from psiu_broker.bus.publisher import Publisher
 from psiu_broker.bus.queries import Queries, Source
 from psiu_broker.bus.round_trip import RoundTrip
@@ -29,6 +30,9 @@ class Served(Source, Protocol):
 
     @property
     def mesh(self) -> Mesh: ...
+
+    @property
+    def programs(self) -> Programs: ...
 
     def describe(self, frame: Frame) -> Description:
         """As `publisher.Describe`."""
@@ -99,6 +103,8 @@ class Bus:
             if zenoh.access is not None:
                 brokers = zenoh.access.brokers
                 await refuse_routers(session, brokers, trunks=bool(configuration.trunks))
+            if any(robot.failsafe is not None for robot in configuration.robots.values()):
+                await watch(session, keys, broker.programs)
             return cls(
                 session,
                 await Publisher.open(session, keys, name, broker.describe, names(configuration)),

@@ -41,6 +41,9 @@ class Client:
             BusError: nobody answers there within `OPEN_TIMEOUT_S`.
         """
         self.keys: Final = Keys(prefix)
+        self.program: Final = uuid4().hex
+        """What it is called where it is missed when it ends without `close`."""
+        self._token: zenoh.LivelinessToken | None = None
         self._tls = tls
         self._denial: CallError | None = None
         self._asked_rights = False
@@ -49,12 +52,15 @@ class Client:
     def __enter__(self) -> "Client":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        self.close(done=error is None)
 
-    def close(self) -> None:
-        """Leave the bus; harmless twice."""
+    def close(self, *, done: bool = True) -> None:
+        """Leave the bus; harmless twice. Robots that this program moved may go on where its work is `done`."""
         with suppress(zenoh.ZError):
+            if self._token is not None and done and not self._session.is_closed():
+                # Declarations arrive in their order, so that this one is known before the token goes.
+                self._session.liveliness().declare_token(f"{self.keys.program(self.program)}/done")
             self._session.close()  # type: ignore[no-untyped-call]
 
     def get_json(self, key: str, timeout_s: float = 3.0) -> dict[str, Any]:
@@ -93,7 +99,7 @@ class Client:
         """
         request = request or CallRequest()
         wait_s = CALL_TIMEOUT_S if request.timeout_s is None else request.timeout_s + DEADLINE_MARGIN_S
-        found = self._get(self._call_key(robot, command), wait_s, request.model_dump_json(exclude_none=True))
+        found = self._get(self._call_key(robot, command), wait_s, self._signed(request))
         if not found:
             self._refuse_where_denied()
             if self.brokers():
@@ -117,7 +123,7 @@ class Client:
         try:
             self._session.put(
                 self._call_key(robot, command),
-                request.model_dump_json(exclude_none=True),
+                self._signed(request),
                 encoding=JSON,
                 attachment=uuid4().bytes,
                 congestion_control=zenoh.CongestionControl.BLOCK,
@@ -165,6 +171,16 @@ class Client:
             self._asked_rights = True
         if self._denial is not None:
             raise self._denial
+
+    def _signed(self, request: CallRequest) -> str:
+        """`request` as one of this program, whose token is there from now on."""
+        if self._token is None:
+            try:
+                self._token = self._session.liveliness().declare_token(self.keys.program(self.program))
+            except zenoh.ZError as error:
+                raise BusError(f"zenoh: {plain(error)}") from error
+        request = request.model_copy(update={"program": request.program or self.program})
+        return request.model_dump_json(exclude_none=True)
 
     def _call_key(self, robot: Address | str, command: str) -> str:
         return _checked(self.keys.call(Address.parse(robot) if isinstance(robot, str) else robot, command))

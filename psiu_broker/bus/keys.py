@@ -61,6 +61,7 @@ class Keys:
         self.every_frame: Final = f"{prefix}/*/*/**"
         self.every_card: Final = f"{prefix}/*"
         self.every_call: Final = f"{prefix}/@call/*/*"
+        self.every_program: Final = f"{prefix}/@program/**"
 
     def decoded(self, source: Address, destination: Address, subject: str) -> str:
         """``psiu/{source}/{destination}/{subject}``; a subject may hold one ``/`` (``node/4``)."""
@@ -96,6 +97,17 @@ class Keys:
     def alive(self, broker: str) -> str:
         """What a broker asks only itself."""
         return self._join("@alive", chunk(broker))
+
+    def program(self, program: str) -> str:
+        """The token of a program whose calls say that they are its."""
+        return self._join("@program", chunk(program))
+
+    def read_program(self, key: str) -> tuple[str, bool]:
+        """The program, and whether it says that it goes in good order; raises ValueError for any other key."""
+        chunks = self._split(key)
+        if len(chunks) not in (2, 3) or chunks[0] != "@program" or chunks[2:] not in ([], ["done"]):
+            raise ValueError(f"{key} is not the token of a program")
+        return text(chunks[1]), len(chunks) == 3
 
     def raw(self, broker: str, link: str) -> str:
         return self._join("@raw", chunk(broker), chunk(link))

@@ -22,6 +22,7 @@ _HERE: Final = "psiu_broker.cli"
         "routes": ("List where frames for each robot go.", f"{_HERE}.tables:routes"),
         "why": ("Tell what would become of a frame from A to B.", f"{_HERE}.paths:why"),
         "trace": ("Have B asked something harmless, and show the way.", f"{_HERE}.paths:trace"),
+        "ping": ("Ask a robot something harmless, again and again.", f"{_HERE}.ping:ping"),
         "mesh": ("Show the brokers, what is between them, and who owns which robot.", f"{_HERE}.mesh:mesh"),
         "conflicts": ("List the names that more than one robot has.", f"{_HERE}.conflicts:conflicts"),
         "ledger": ("Show the fate of every frame.", f"{_HERE}.ledger:ledger"),

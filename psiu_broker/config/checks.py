@@ -8,6 +8,7 @@ from ipaddress import ip_address
 from typing import Final
 
 from psiu_broker.adapter import Adapter, Peer
+from psiu_broker.codecs import psiu_ascii
 from psiu_broker.codecs.codec import Codec, Directory
 from psiu_broker.codecs.paced import PacedCodec
 from psiu_broker.codecs.psiu_hexa import PsiuHexa
@@ -24,11 +25,15 @@ from psiu_broker.config.tables import (
     MeshConfiguration,
     PolicyRule,
     RobotConfiguration,
+    RobotTable,
     TrunkConfiguration,
     ZenohConfiguration,
 )
+from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.profiles.hexa import RESERVED, Node
+from psiu_broker.profiles.profile import Profile
+from psiu_broker.profiles.psiu import PsiuProfile
 from psiu_broker.protocols import PROTOCOLS
 
 _WORD: Final = re.compile(r"[!-~]+")
@@ -155,6 +160,34 @@ def check_paced(codec: type[Codec], written: Collection[str], key: Key, problems
         if option in written:
             text = f"{codec.protocol} sends packets at rate_hz, each with the newest for every robot; remove it"
             problems.add((*key, option), text)
+
+
+def check_proxied(links: Iterable[LinkConfiguration], problems: Problems) -> None:
+    """Only PSIU ASCII has the word that the sender would hear."""
+    for link in links:
+        if link.options.proxy_errors and link.protocol != psiu_ascii.PROTOCOL:
+            text = f"is for {psiu_ascii.PROTOCOL}, and link {link.name} speaks {link.protocol}; remove it"
+            problems.add(("links", link.name, "proxy_errors"), text)
+
+
+def check_promises(robot: RobotTable, profile: Profile, key: Key, problems: Problems) -> None:
+    """The robot knows what it is to be told again, and what is to stop it."""
+    known = {name for command in profile.commands() for name in (command.name, *command.aliases)}
+    if not isinstance(profile, PsiuProfile):  # whose vocabulary is open
+        for position, command in enumerate(robot.repeatable):
+            if command not in known:
+                text = f"there is no command {got(command)}; {suggestion(command, known)}"
+                problems.add((*key, "repeatable", position), text)
+    failsafe = robot.failsafe
+    if failsafe is None:
+        return
+    try:
+        request = profile.request(failsafe.command, failsafe.parameters)
+    except CallError as error:
+        problems.add((*key, "failsafe"), f"{error}; write what stops the robot")
+        return
+    if request.question or request.procedure is not None:
+        problems.add((*key, "failsafe", "command"), f"{got(failsafe.command)} stops no robot; write what does")
 
 
 def check_identities(

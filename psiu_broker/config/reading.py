@@ -24,6 +24,8 @@ from psiu_broker.config.checks import (
     check_nodes,
     check_paced,
     check_policy,
+    check_promises,
+    check_proxied,
     check_rate,
     check_trunk,
     warnings_about,
@@ -120,6 +122,7 @@ def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> 
     whole_links = {name: link for name, link in links.items() if link}
     whole_robots = {name: robot for name, robot in robots.items() if robot}
     check_devices(whole_links.values(), trunks.values(), problems)
+    check_proxied(whole_links.values(), problems)
     if None not in links.values():
         check_ends(whole_links, whole_robots, problems)
         check_far_names(broker, whole_links.values(), whole_robots, problems)
@@ -314,10 +317,13 @@ def _robot(
     if options is None:
         return None
     try:
-        protocol.profile.make(link.codec, options, link.options.timeout_s, datagrams=link.adapter.datagrams)
+        profile = protocol.profile.make(link.codec, options, link.options.timeout_s, datagrams=link.adapter.datagrams)
     except ValueError as error:
         problems.add(key, str(error))
-    return RobotConfiguration(name, robot.link, link.protocol, address, peer, options)
+    else:
+        check_promises(robot, profile, key, problems)
+    repeatable = frozenset(robot.repeatable)
+    return RobotConfiguration(name, robot.link, link.protocol, address, peer, options, repeatable, robot.failsafe)
 
 
 def _address(robot: RobotTable, link: LinkConfiguration, key: Key, problems: Problems) -> Address | None:

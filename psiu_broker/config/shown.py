@@ -18,6 +18,8 @@ def shown(configuration: Configuration) -> dict[str, Any]:
             robot.name: {
                 "link": robot.link,
                 "address": None if robot.address is None else robot.address.number,
+                "repeatable": sorted(robot.repeatable),
+                "failsafe": None if robot.failsafe is None else robot.failsafe.model_dump(mode="json"),
                 **robot.options.model_dump(mode="json"),
             }
             for robot in configuration.robots.values()

@@ -64,6 +64,12 @@ def _prefix(prefix: str) -> str:
     return prefix
 
 
+def _losses(losses: tuple[str, ...]) -> tuple[str, ...]:
+    if not losses:
+        raise ValueError('expected at least one, got none; write on = ["program_gone"], or leave failsafe out')
+    return _once(losses)
+
+
 LINK_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 ENDPOINT: Final = re.compile(
     r"(?:tcp|tls|udp|ws)/(?P<host>\[[^\s\[\]]+\]|[^\s:/\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?|unixsock-stream/\S+"
@@ -80,6 +86,11 @@ File = Annotated[str, Field(min_length=1)]
 """A path; where it is relative, from the folder of the configuration."""
 Names = Annotated[
     tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
+    AfterValidator(_once),
+    Field(json_schema_extra={"uniqueItems": True}),
+]
+Commands = Annotated[
+    tuple[Annotated[str, Field(min_length=1)], ...],
     AfterValidator(_once),
     Field(json_schema_extra={"uniqueItems": True}),
 ]
@@ -225,10 +236,29 @@ class LinkOptions(_Table):
         30, ge=1, le=100_000, description="robots heard here for the first time; more are not listened to"
     )
     plays: str | None = Field(None, description="the robot that programs at the far end find there, and command")
+    proxy_errors: bool = Field(
+        False, description="PSIU ASCII: answer falha for a robot that cannot be reached; no other broker may be here"
+    )
 
     def longest_wait_s(self, command: str) -> float:
         """How old a frame with that command word may be when it is sent."""
         return self.question_max_age_s if is_question(command) else self.max_age_s
+
+
+Loss = Literal["program_gone", "link_silent", "broker_stop"]
+"""What may happen to a robot that moves: the program that moved it last is gone; nothing more comes from the robot, or
+its link is down; the broker stops."""
+
+
+class FailsafeConfiguration(_Table):
+    """``[robots.NAME.failsafe]``: what stops a robot that somebody moved and that is left alone."""
+
+    command: Annotated[str, Field(min_length=1)] = Field(description="what stops it")
+    parameters: tuple[int | float | str, ...] = Field((), max_length=64, description="of the command")
+    on: Annotated[tuple[Loss, ...], AfterValidator(_losses), Field(json_schema_extra={"minItems": 1})] = Field(
+        ("program_gone", "broker_stop"), description="when"
+    )
+    silent_s: Seconds = Field(5.0, description='with "link_silent": how long nothing may come from the robot')
 
 
 class RobotTable(_Table):
@@ -237,6 +267,8 @@ class RobotTable(_Table):
     link: str = Field(description="the name of its link")
     address: Number | None = Field(None, description="its address, where its protocol knows robots by numbers")
     peer: str | None = Field(None, description='where it is on its link; "host:port" over UDP')
+    repeatable: Commands = Field((), description="commands that are told again after silence, as questions are")
+    failsafe: FailsafeConfiguration | None = Field(None, description="what stops it when nobody is left who could")
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +312,9 @@ class RobotConfiguration:
     """As the link's adapter knows it, ``(host, port)`` over UDP; None where the file leaves it out."""
     options: RobotOptions
     """The `Options` of its protocol's profile."""
+    repeatable: frozenset[str] = frozenset()
+    """Its commands that may be sent again although the robot may have carried them out."""
+    failsafe: FailsafeConfiguration | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ A call goes through these states, and every wait ends at its deadline:
     turn ──> quiet ──> offered ──> sent ──reply──────────────> Answer
                         │           │ ├──AGAIN──> settled ──> offered (bounded by `retries`)
                         │           │ ├──BUSY───> AVAIL? every `busy_poll_s` ──FREE──> offered
-                        │           │ └──silence> offered again if it is a question, else outcome_unknown
+                        │           │ └──silence> offered again if it is a question or repeatable, else outcome_unknown
                         │           │ └──or that silence is the answer, where the protocol has no other
                         └───────────┴──dropped, not possible, link down, shutting down: CallError
 
@@ -78,12 +78,14 @@ class Conversations:
         fresh_s: float = inf,
         retries: int | None = None,
         busy_poll_s: float | None = None,
+        repeatable: bool = False,
     ) -> Answer:
         """Tell `robot` a command and return its answer within `timeout_s`.
 
         Without `timeout_s` the deadline is as long as all tries take. A command that has not left within
         `fresh_s` is not sent; one that is to be fresh and waits for its turn gives way to a newer one like it.
-        A procedure is not begun where it could not be ended in time.
+        A procedure is not begun where it could not be ended in time. What is `repeatable` is sent again on
+        silence, as a question is.
 
         Raises:
             CallError: there is no answer; its code says why.
@@ -95,13 +97,33 @@ class Conversations:
         if timeout_s is None:
             timeout_s, patience_s = takes_s + request.timeout_s * tries, request.timeout_s
         else:
-            patience_s = max(request.timeout_s, timeout_s / tries) if request.question else timeout_s
+            patience_s = max(request.timeout_s, timeout_s / tries) if request.question or repeatable else timeout_s
         if request.procedure is not None and takes_s > timeout_s:
             raise CallError("refused", f"{command} takes {takes_s:.1f} s, more than the {timeout_s:.3g} s it was given")
         call = _under_way(robot, command, request, timeout_s, fresh_s)
         call.leave_by -= takes_s
         call.patience_s, call.retries, call.busy_poll_s = patience_s, retries, busy_poll_s or self._busy_poll_s
-        async with self._turn(call, replaceable=fresh_s < inf and not request.question):
+        call.repeatable = repeatable
+        return await self._answer(call, replaceable=fresh_s < inf and not request.question)
+
+    async def stop(
+        self, robot: Robot, command: str, parameters: Sequence[Value], *, timeout_s: float, retries: int
+    ) -> Answer:
+        """As `call`, of what stops `robot`, whatever its word is: before anything else, again on silence, and also
+        once calls are closed.
+
+        Raises:
+            CallError: there is no answer; its code says why.
+        """
+        request = robot.profile.request(command, parameters)
+        call = _under_way(robot, command, request, timeout_s, timeout_s)
+        call.patience_s, call.retries, call.busy_poll_s = timeout_s / (1 + retries), retries, self._busy_poll_s
+        call.repeatable = call.urgent = True
+        return await self._answer(call, replaceable=False)
+
+    async def _answer(self, call: UnderWay, *, replaceable: bool) -> Answer:
+        request = call.request
+        async with self._turn(call, replaceable=replaceable):
             await self._quiet(call)
             if request.procedure is not None:
                 reply, at = await self._procedures.perform(call, request.procedure)
@@ -192,7 +214,7 @@ class Conversations:
             if call.sending is not None and self._complaints.blame(call.sending, traffic, now):
                 call.answer(Notice.AGAIN, now)
                 self._complaints.settle(call.sending, traffic)
-            elif call.request.question or call.is_stop:
+            elif call.may_repeat or call.is_stop:
                 call.hear(Notice.AGAIN, now)
 
     def undelivered(self, frame: Frame, error: CallError) -> None:
@@ -220,23 +242,24 @@ class Conversations:
         return any(call.sent and call.request.subject == "ping" for call in self._under_way.get(address, ()))
 
     def close(self) -> None:
-        """End every call with shutting_down, and refuse new ones."""
+        """End every call with shutting_down, and refuse new ones, unless they are urgent."""
         self._closed = True
         for calls in self._under_way.values():
             for call in calls:
-                call.hear(_shutting_down(), 0.0)
+                if not call.urgent:
+                    call.hear(_shutting_down(), 0.0)
 
     @asynccontextmanager
     async def _turn(self, call: UnderWay, *, replaceable: bool) -> AsyncIterator[None]:
         """Wait until no other call to this robot is under way, or, for a stop, until no procedure is."""
-        self._refuse_when_closed()
+        self._refuse_when_closed(call)
         robot, loop = call.robot, asyncio.get_running_loop()
         came = loop.time()
         if call.is_stop or call.is_ending:
             await self._procedures.interrupt(robot.address, call.command, call.leave_by)
         if call.is_stop:
             await self._procedures.mend(robot)
-            self._refuse_when_closed()
+            self._refuse_when_closed(call)
             call.put_off(loop.time() - came)  # what had to be ended first must not make a stop too late
             self._overtake(call)
             with self.hearing(call):
@@ -252,7 +275,7 @@ class Conversations:
             motion=call.is_motion,
         ):
             await self._procedures.mend(robot)
-            self._refuse_when_closed()
+            self._refuse_when_closed(call)
             with self.hearing(call):
                 yield
 
@@ -317,10 +340,12 @@ class Conversations:
                 raise CallError("impossible", f"{call.robot.name} says that {call.command} is impossible")
             elif reading is None and call.request.silence is not None and call.sent:
                 return call.request.silence, loop.time()
-            elif reading is None and not call.request.question:
-                raise _outcome_unknown(call, loop.time())
+            elif reading is None and not (call.may_repeat and tries <= call.retries and loop.time() < call.again_by):
+                if call.request.question:
+                    raise _no_answer(call, tries, understood=True)
+                raise _outcome_unknown(call, tries)
             elif tries > call.retries or loop.time() >= call.deadline:
-                raise _no_answer(call, tries, understood=reading is None)
+                raise _no_answer(call, tries, understood=False)
 
     async def _after_sending(self, call: UnderWay, until: float) -> tuple[Reading | None, float]:
         """What came of one try: a reply, None for silence, AGAIN once the robot is quiet, FREE after it was busy.
@@ -402,8 +427,8 @@ class Conversations:
         if not call.waiting:
             call.sending = self._complaints.sending(robot.link, before, self._links.traffic(robot.link))
 
-    def _refuse_when_closed(self) -> None:
-        if self._closed:
+    def _refuse_when_closed(self, call: UnderWay) -> None:
+        if self._closed and not call.urgent:
             raise _shutting_down()
 
 
@@ -430,9 +455,11 @@ def _overtaken(call: UnderWay) -> CallError:
     return CallError("expired", f"a stop came for {call.robot.name}; {call.command} was not sent{again}")
 
 
-def _outcome_unknown(call: UnderWay, now: float) -> CallError:
-    text = f"{call.robot.name} did not answer {call.command} in {now - call.begun:.3g} s: it may have been done or not"
-    return CallError("outcome_unknown", f"{text}, so it was not sent again")
+def _outcome_unknown(call: UnderWay, tries: int) -> CallError:
+    waited_s = asyncio.get_running_loop().time() - call.begun
+    text = f"{call.robot.name} did not answer {call.command} in {waited_s:.3g} s: it may have been done or not"
+    again = f"; it was sent {tries} times" if tries > 1 else "" if call.may_repeat else ", so it was not sent again"
+    return CallError("outcome_unknown", text + again)
 
 
 def _no_answer(call: UnderWay, tries: int, *, understood: bool) -> CallError:

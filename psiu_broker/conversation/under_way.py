@@ -52,6 +52,10 @@ class UnderWay:
     patience_s: float = 0.0
     retries: int = 0
     busy_poll_s: float = 0.0
+    repeatable: bool = False
+    """It may be sent again on silence, although it moves the robot."""
+    urgent: bool = False
+    """It is a stop, whatever its word."""
     waiting: list[Offer] = field(default_factory=list)
     sent: int = 0
     """How many frames have left, the last of them, and when it did."""
@@ -67,7 +71,17 @@ class UnderWay:
 
     @property
     def is_stop(self) -> bool:
-        return is_stop(self.request.subject)
+        return self.urgent or is_stop(self.request.subject)
+
+    @property
+    def may_repeat(self) -> bool:
+        """Whether it may be sent again where nobody knows what became of it."""
+        return self.request.question or self.repeatable
+
+    @property
+    def again_by(self) -> float:
+        """Until when it is not too late for it to be sent again."""
+        return self.deadline if self.request.question else min(self.deadline, self.leave_by)
 
     @property
     def is_motion(self) -> bool:

@@ -128,6 +128,11 @@ class HexaProfile(Profile):
         """All alike: ACK and NAK name no request, and a sensor's answer no sensor."""
         return ""
 
+    def moves(self, frame: Frame) -> bool:
+        """What commands a node that is no sensor, and what has fields, whatever they mean."""
+        node = self._by_number.get(frame.payload[0]) if len(frame.payload) == 2 else None
+        return len(frame.payload) > 1 and frame.payload[0] != 0 and (node is None or node.is_actuator)
+
     def _signal(self, request: Request, payload: bytes) -> Reply | None:
         if not request.subject.startswith("node/"):
             return None

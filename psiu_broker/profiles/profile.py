@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Kind, Value
+from psiu_broker.routing.outbox import is_stop
 
 Status = Literal["sucesso", "falha"]
 
@@ -149,6 +150,10 @@ class Profile(ABC):
 
         PSIU numbers no message, so that a late answer to one such request reads as the answer to the next.
         """
+
+    def moves(self, frame: Frame) -> bool:
+        """Whether `frame`, sent to the robot, may set it in motion; never raises. Stops do not."""
+        return not is_stop(frame.subject)
 
     def greeting(self) -> Sequence[Request]:
         """What to tell or ask the robot when its link has opened, in this order."""

@@ -211,6 +211,10 @@ class PsiuProfile(Profile):
     def answers_to(self, request: Request) -> str:
         return canonical(request.subject)
 
+    def moves(self, frame: Frame) -> bool:
+        words = said(frame)
+        return not words.answer and canonical(words.command) not in _QUESTIONS and super().moves(frame)
+
 
 def _check(command: Command, values: Sequence[Value]) -> None:
     """Raises: CallError refused, naming what `command` takes. exibecomando tells counts, not their order."""

@@ -55,6 +55,9 @@ LINK_DOWN: Final = "link_down"
 MALFORMED: Final = "malformed"
 """Bytes that were no frame."""
 
+UNREACHED: Final[frozenset[Verdict]] = frozenset({NO_ROUTE, LINK_DOWN, EXPIRED, QUEUE_FULL, REFUSED})
+"""The verdicts of which a sender may be told that its robot was not reached."""
+
 KEPT: Final[frozenset[Verdict]] = frozenset({DELIVERED, ANSWERED})
 """The verdicts that are not a drop."""
 
