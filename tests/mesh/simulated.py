@@ -7,7 +7,7 @@ Tokens behave as Zenoh's do: they come in their order, they go at once with a se
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import combinations, count
 from typing import Final, NamedTuple
 
@@ -126,6 +126,21 @@ class Antenna(MemoryTransport):
         return super().write(data, peer)
 
 
+class Alarm:
+    """A timer on the clock of the simulation."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._call = call
+        self._cancelled = False
+
+    def cancel(self) -> None:
+        self._cancelled = True
+
+    def ring(self) -> None:
+        if not self._cancelled:
+            self._call()
+
+
 class Station:
     """One life of a broker: its exchange and mesh, and links whose far ends are lists. Is its own bus and resident."""
 
@@ -133,7 +148,13 @@ class Station:
     raw_listened = False
 
     def __init__(
-        self, simulation: "Simulation", name: str, bindings: tuple[Binding, ...], links: Sequence[str], clock_s: float
+        self,
+        simulation: "Simulation",
+        name: str,
+        bindings: tuple[Binding, ...],
+        links: Sequence[str],
+        clock_s: float,
+        options: Mapping[str, object],
     ) -> None:
         self.simulation = simulation
         self.name = name
@@ -164,15 +185,22 @@ class Station:
         self.exchange.join(self.mesh, MAX_AGE_S)
         self.antennas: dict[str, Antenna] = {}
         for link in links:
-            made = configuration(link, adapter=MemoryAdapter(), route_age_s=300.0)
+            made = configuration(link, adapter=MemoryAdapter(), **{"route_age_s": 300.0, **options})
             self.exchange.add(
-                Link(made, lambda made=made: codec_of(made), self.exchange, clock=lambda: self.now)  # type: ignore[misc]
+                Link(
+                    made, lambda made=made: codec_of(made), self.exchange, clock=lambda: self.now, call_at=self.call_at
+                )  # type: ignore[misc]
             )
             self.plug(link)
 
     @property
     def now(self) -> float:
         return self.simulation.now + self._clock_s
+
+    def call_at(self, when: float, call: Callable[[], None]) -> "Alarm":
+        alarm = Alarm(call)
+        self.simulation.after(when - self.now, lambda: self.dispatch(alarm.ring))
+        return alarm
 
     def plug(self, link: str) -> None:
         self.antennas[link] = Antenna(self)
@@ -289,13 +317,17 @@ class Simulation:
         bindings: dict[str, tuple[Binding, ...]] | None = None,
         links: Sequence[str] = (RADIO, WIFI),
         clocks_apart: bool = True,
+        options: Mapping[str, object] | None = None,
     ) -> None:
+        """`options` are those of every link, where they are not the usual ones."""
         self.now = 1000.0
         self.loses: Callable[[str, str, str], bool] = lambda *_: False
         self.delay_of: dict[str, float] = {}
         """By kind of message, where it is not `delay_s`."""
         self.sent: Counter[str] = Counter()
         """Messages by their kind, once for each broker that they go to."""
+        self.lost: Counter[str] = Counter()
+        """Those of them that never came."""
         self.beat: Beat | None = None
         """The last one."""
         self.stations: dict[str, Station] = {}
@@ -305,6 +337,7 @@ class Simulation:
         self._links = links
         self._random = random.Random(seed)
         self._clocks_apart = clocks_apart
+        self._options = options or {}
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
         self._sessions: dict[str, Session] = {}
@@ -318,7 +351,9 @@ class Simulation:
 
     def start(self, name: str) -> Station:
         clock_s = self._random.uniform(-500, 5000) if self._clocks_apart else 0.0
-        station = self.stations[name] = Station(self, name, self.bindings.get(name, ()), self._links, clock_s)
+        station = self.stations[name] = Station(
+            self, name, self.bindings.get(name, ()), self._links, clock_s, self._options
+        )
         session = self._sessions[name] = Session(self, name, next(self._serial))
         station.mesh.attach(session, station.now)
         for other in self.others(name):
@@ -496,6 +531,7 @@ class Simulation:
         """In its order among its kind, unless it is lost."""
         self.sent[kind] += 1
         if to not in self.stations or self.loses(kind, sender, to):
+            self.lost[kind] += 1
             return
         self._send(kind, sender, to, deliver)
 
@@ -509,6 +545,8 @@ class Simulation:
         def arrive() -> None:
             if self.reach(sender, to) and self.stations.get(to) is station:
                 deliver(station)
+            else:
+                self.lost[kind] += 1
 
         self.after(at - self.now, arrive)
 
