@@ -146,12 +146,13 @@ class Router:
         """Decide for a frame that arrived, and learn from it."""
         routes = self._routes
         source = routes.get(frame.source)
-        is_there = source is not None and source.way is arrived
-        # Before its double is looked for: what is turned away must not stand in the way of what it imitates.
-        if not is_there and self._is_spoofed(source, arrived):
-            return self._turn_away_unless_double(frame, SPOOFED, arrived, now)
-        if self.quarantine.held and not is_there and self._is_held_back(frame, source, arrived, now):
-            return self._turn_away_unless_double(frame, QUARANTINED, arrived, now)
+        there = source if source is not None and source.way is arrived else None
+        if there is None:
+            # Before its double is looked for: what is turned away must not stand in the way of what it imitates.
+            if self._is_spoofed(source, arrived):
+                return self._turn_away_unless_double(frame, SPOOFED, arrived, now)
+            if self.quarantine.held and self._is_held_back(frame, source, arrived, now):
+                return self._turn_away_unless_double(frame, QUARANTINED, arrived, now)
         policy = self.policy
         if policy is not None and arrived is not SELF:
             rule = policy.denial(frame, arrived)
@@ -161,9 +162,9 @@ class Router:
         if self._duplicates.is_double(self._identity(frame), arrived, now, frame.subject):
             self.books.arrived(frame.source)
             return self._note_double(frame, arrived, now)
-        if source is not None and is_there:
-            source.heard_at = now
-            source.frames += 1
+        if there is not None:
+            there.heard_at = now
+            there.frames += 1
         else:
             self.books.arrived(frame.source)
             wrong = self._learn(frame, source, arrived, now)
