@@ -2,7 +2,8 @@
 
 Zenoh's rules judge what programs say, not what its routers tell one another of ways: one with a listener's certificate
 could say that the way to every broker leads through it, and then pass nothing on. So whoever comes as a router and is
-no broker by its certificate is hung up on, each time.
+no broker by its certificate is hung up on, each time. Where the brokers are routers themselves, a message may still
+meet it in that moment; a way that is lost for good, none does.
 """
 
 import logging
