@@ -16,7 +16,7 @@ from psiu_broker.messages import Ledger, RobotAccount
 def test_robot_by_robot_the_sums_are_those_of_all_links(lab: Any) -> None:
     lab.run("call", "MNERIM", "parafrente", "1")
     robots = [RobotAccount.model_validate(each) for each in lab.json("ledger", "--robots")]
-    assert {"MNERIM", "BETA", "BRACO", "base", None} == {each.robot for each in robots}
+    assert {"MNERIM", "BETA", "BRACO", "base", None} <= {each.robot for each in robots}
     assert {each.robot: each.link for each in robots}["MNERIM"] == "radio"
     for each in robots:
         assert each.arrived == each.delivered + each.answered + sum(each.dropped.values()) + each.waiting
