@@ -23,7 +23,7 @@ from psiu_broker.config import (
     ZenohConfiguration,
     load,
 )
-from psiu_broker.config.tables import FailsafeConfiguration, RobotTable
+from psiu_broker.config.tables import FailsafeConfiguration, PolicyRule, RobotTable
 from psiu_broker.errors import CallCode
 from psiu_broker.messages import Answer, Decoded, Refusal
 from psiu_broker.protocols import PROTOCOLS
@@ -37,8 +37,11 @@ GROUPS: dict[str, click.Group] = {"psiu": tool.psiu, "psiu-broker": daemon.psiu_
 
 MANY_BROKERS = re.compile(r"^## (?:Many|Muitos) brokers\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 PROTOCOLS_TOLD = re.compile(r"^## (?:Protocols|Protocolos)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
-FAILSAFE_TOLD = re.compile(r"^## (?:When nobody is left|Quando não sobra ninguém)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+FAILSAFE_TOLD = re.compile(
+    r"^## (?:When nobody is left|Quando não sobra ninguém)\n.*?(?=^## )", re.MULTILINE | re.DOTALL
+)
 RIGHTS_TOLD = re.compile(r"^## (?:Who may do what|Quem pode o quê)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+POLICY_TOLD = re.compile(r"^## (?:Who commands whom|Quem comanda quem)\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MODELS: dict[str, type[BaseModel]] = {
     "[broker]": BrokerConfiguration,
@@ -46,6 +49,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "[zenoh.tls]": TlsConfiguration,
     "[zenoh.access]": AccessConfiguration,
     "[mesh]": MeshConfiguration,
+    "[[policy]]": PolicyRule,
     "[links.NAME]": LinkOptions,
     "[robots.NAME]": RobotTable,
     "[robots.NAME.failsafe]": FailsafeConfiguration,
@@ -105,10 +109,12 @@ def test_both_languages_have_the_same_sections_examples_and_tables() -> None:
 def test_ten_minutes_of_reading(readme: str) -> None:
     [many], [protocols] = MANY_BROKERS.findall(readme), PROTOCOLS_TOLD.findall(readme)
     [rights], [failsafe] = RIGHTS_TOLD.findall(readme), FAILSAFE_TOLD.findall(readme)
-    apart = sum(map(_words, (many, protocols, rights, failsafe)))
+    [policy] = POLICY_TOLD.findall(readme)
+    apart = sum(map(_words, (many, protocols, rights, policy, failsafe)))
     assert _words(readme) - apart <= 2300
     assert _words(failsafe) <= 170
     assert _words(rights) <= 200
+    assert _words(policy) <= 260
     assert _words(many) <= 650
     assert _words(protocols) <= 600
 
@@ -128,6 +134,15 @@ def test_the_configurations_load(readme: str, tmp_path: Path) -> None:
         assert configuration.broker.name == "base"
     assert set(configuration.links) == {"radio", "wifi", "arm"}
     assert configuration.robots["BRACO"].options.nodes["garra"].type == "servo"
+
+
+@READMES
+def test_the_rules_load(readme: str, tmp_path: Path) -> None:
+    [whole] = [block for block in blocks(readme, "toml") if "[links.wifi]" in block]
+    [rules] = [block for block in blocks(readme, "toml") if block.startswith("[[policy]]")]
+    file = tmp_path / "broker.toml"
+    file.write_text(whole + rules)
+    assert [rule.action for rule in load(file).policy] == ["allow", "deny"]
 
 
 @READMES
