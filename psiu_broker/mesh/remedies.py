@@ -139,11 +139,15 @@ class Remedies:
         """Do more each time against the same trouble with a broker: declare anew, then connect anew.
 
         In steps, because each remedy is itself a trouble for others for a moment; the last one, which
-        ends every link, is for a broker that is announced and silent, and for twice at most.
+        ends every link, is for a broker that is announced and silent, and for twice at most. A link to
+        one that is silent is ended first of all: Zenoh should have ended it, and what is declared would
+        wait for room in it, and everything else for that.
         """
-        if remedy.steps <= 2:
+        linked = zenoh_id in self._bus.linked
+        first = linked and trouble == SILENT and remedy.steps == 1
+        if remedy.steps <= 2 and not first:
             self.declare_anew(now, f"{name} is {trouble}")
-        elif zenoh_id in self._bus.linked:
+        elif linked:
             log.warning("mesh: connecting anew: %s is %s", name, trouble)
             self._bus.hang_up(zenoh_id)
         elif (
