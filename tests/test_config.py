@@ -844,3 +844,34 @@ def test_what_may_leave_on_a_link_is_limited_in_all_and_by_subject(read):
     assert (options.max_frames_s, options.max_bytes_s, options.newest_wins) == (20, 480.5, ("node/*", "motor"))
     assert [(name, each.frames_s, each.bytes_s) for name, each in options.limits.items()] == [("node/*", 9, 90)]
     assert (options.longest_wait_s("parafrente"), options.longest_wait_s("ExibeComandos")) == (2.0, 4.0)
+
+
+LEFT_ALONE = """
+    [robots.MNERIM]
+    link = "radio"
+    repeatable = ["buzina"]
+    failsafe = { command = "pare", on = ["program_gone", "link_silent"], silent_s = 2 }
+"""
+
+
+def test_a_robot_may_say_what_stops_it_and_what_may_be_told_again(read):
+    robot = read(BROKER + RADIO + LEFT_ALONE).robots["MNERIM"]
+    assert robot.repeatable == {"buzina"}
+    assert robot.failsafe.on == ("program_gone", "link_silent")
+    assert (robot.failsafe.command, robot.failsafe.parameters, robot.failsafe.silent_s) == ("pare", (), 2)
+    assert read(BROKER + RADIO + '[robots.MNERIM]\nlink = "radio"').robots["MNERIM"].failsafe is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (RADIO + LEFT_ALONE.replace('"pare"', '"qualseunome"'), "robots.MNERIM.failsafe.command: "),
+        (RADIO + LEFT_ALONE.replace('"pare"', '"parafrente"'), "robots.MNERIM.failsafe: parafrente takes"),
+        (RADIO + LEFT_ALONE.replace('"program_gone", "link_silent"', ""), "robots.MNERIM.failsafe.on: expected at"),
+        (RADIO + LEFT_ALONE.replace('"link_silent"', '"gone"'), "robots.MNERIM.failsafe.on"),
+        (HEXA + LEFT_ALONE.replace("radio", "hexa").replace("failsafe", "address = 3\n    failsafe"), "robots.MNERIM."),
+        (HEXA + "proxy_errors = true", "links.hexa.proxy_errors: is for psiu-ascii"),
+    ],
+)
+def test_a_stop_that_stops_nothing_is_refused(problems, text, expected):
+    assert any(line.startswith(expected) for line in problems(BROKER + text)), problems(BROKER + text)

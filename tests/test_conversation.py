@@ -563,3 +563,35 @@ async def test_a_motion_that_waited_for_a_late_answer_is_not_sent_after_a_stop()
     await robots.ascii("pare")
     assert (await refused(call)).code == "expired"
     assert robots.payloads == [b"parafrente 1", b"pare"]
+
+
+@jumping
+async def test_what_may_be_repeated_is_told_again_on_silence_and_then_given_up() -> None:
+    robots = Robots()
+    error = await refused(robots.ascii("buzina", repeatable=True))
+    assert error.code == "outcome_unknown"
+    assert "it was sent 3 times" in str(error)
+    assert [at for at, _ in robots.sent] == pytest.approx([0, 2, 4])
+    assert robots.idle
+
+
+@jumping
+async def test_what_may_be_repeated_is_not_told_again_once_it_is_too_late() -> None:
+    robots = Robots()
+    error = await refused(robots.ascii("buzina", repeatable=True, fresh_s=1.5))
+    assert error.code == "outcome_unknown"
+    assert len(robots.sent) == 1
+
+
+@jumping
+async def test_a_stop_of_any_word_waits_for_nobody_is_told_again_and_goes_also_when_calls_are_closed() -> None:
+    robots = Robots()
+    moving = asyncio.create_task(refused(robots.ascii("parafrente", 100)))
+    await asyncio.sleep(0.1)
+    robots.conversations.close()
+    stop = robots.conversations.stop(robots.of_words(), "descansa", [], timeout_s=1.5, retries=2)
+    assert (await refused(stop)).code == "outcome_unknown"
+    assert (await moving).code == "shutting_down"
+    assert [(at, payload) for at, payload in robots.sent[1:]] == [
+        (pytest.approx(at), b"descansa") for at in (0.1, 0.6, 1.1)
+    ]

@@ -555,3 +555,34 @@ async def test_a_discovery_asks_nobody_where_everyone_may_not_be_asked(labs: Lab
     await lab.call("base", "discover", timeout_s=0.05)
     assert said(lab.far["radio"]) == ["?? qualseunome base"]
     assert lab.far["quiet"].wires == []
+
+
+# Senders whose robots are out of reach.
+
+
+async def test_a_sender_hears_falha_in_place_of_a_robot_out_of_reach_only_where_it_is_to(labs: Labs) -> None:
+    told, untold = labs(words(proxy_errors=True), words("other")), labs(words(), words("other"))
+    for lab in (told, untold):
+        lab.know(MNERIM, "other")
+        lab.know(Address.named("PC"))
+        lab.far["radio"].written.clear()
+        lab.links["other"].lost(LinkLost("gone"))
+        lab.hears("radio", wire("PC", "MNERIM", "parafrente", "10"))
+        lab.hears("radio", wire("PC", "MNERIM", "parafrente", "sucesso"))
+        lab.hears("radio", wire("PC", "MNERIM", "qualseunome"))
+        lab.exchange.expire(time.monotonic() + 60)
+    assert [each for each in said(told.far["radio"]) if "falha" in each] == ["PC parafrente falha MNERIM"]
+    assert not [each for each in said(untold.far["radio"]) if "falha" in each]
+
+
+async def test_a_sender_hears_falha_of_what_waited_too_long_once_in_a_while(labs: Labs) -> None:
+    lab = labs(words(proxy_errors=True), words("other"))
+    lab.know(MNERIM, "other")
+    lab.know(Address.named("PC"))
+    lab.far["radio"].written.clear()
+    lab.far["other"].full = True
+    for _ in range(3):
+        lab.hears("radio", wire("PC", "MNERIM", "parafrente", "10"))
+    assert said(lab.far["radio"]) == []
+    lab.exchange.expire(time.monotonic() + 60)
+    assert said(lab.far["radio"]) == ["PC parafrente falha MNERIM"]

@@ -1,0 +1,223 @@
+"""Who is missed, and what a robot is told then; no bus, no links, and the time as the test says."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from psiu_broker.codecs import psiu_ascii
+from psiu_broker.config.tables import (
+    BrokerConfiguration,
+    Configuration,
+    FailsafeConfiguration,
+    RobotConfiguration,
+    ZenohConfiguration,
+)
+from psiu_broker.errors import CallError
+from psiu_broker.failsafe import AGAIN_S, AWAITED_S, Failsafe
+from psiu_broker.frame import EVERYONE, Address, Frame
+from psiu_broker.profiles import PsiuProfile
+from psiu_broker.profiles.psiu import PsiuOptions
+
+MNERIM, PC = Address.named("MNERIM"), Address.named("PC")
+PROFILE = PsiuProfile()
+
+
+class Lab:
+    """MNERIM on `radio`; each stop leaves at once, unless `fails` says why it cannot."""
+
+    def __init__(self, *on: str, command: str = "pare", silent_s: float = 5.0) -> None:
+        options = FailsafeConfiguration.model_validate(
+            {"command": command, "on": on or ("program_gone", "broker_stop"), "silent_s": silent_s}
+        )
+        robot = RobotConfiguration("MNERIM", "radio", "psiu-ascii", None, None, PsiuOptions(), failsafe=options)
+        made = Configuration(BrokerConfiguration(name="base"), ZenohConfiguration(), {}, {"MNERIM": robot})
+        self.now, self.heard_at, self.stops = 100.0, 0.0, 0
+        self.fails: CallError | None = None
+        self.failsafe = Failsafe(made, self._stop, lambda _: PROFILE, lambda _: self.heard_at, lambda: self.now)
+        self.command = command
+
+    def moves(self, program: str | None = None, word: str = "parafrente") -> None:
+        """A call of a program's, or of nobody's in particular, leaves."""
+        request = PROFILE.request(word, [] if word != "parafrente" else [10])
+        ward, frame = self.failsafe.ward(MNERIM), self.frame(request.payload.decode())
+        assert ward is not None
+        self.failsafe.offered(ward, frame, request, program)
+        self.failsafe.left("radio", frame, self.now)
+
+    def frame(self, text: str, to: Address = MNERIM) -> Frame:
+        return psiu_ascii.message(PC, to, *text.split())
+
+    async def after(self, seconds: float) -> int:
+        """How often MNERIM was told to stop so far."""
+        self.now += seconds
+        self.failsafe.tick(self.now)
+        for _ in range(5):
+            await asyncio.sleep(0)
+        return self.stops
+
+    async def _stop(self, robot: Address, options: FailsafeConfiguration, timeout_s: float) -> None:
+        self.stops += 1
+        if self.fails is not None:
+            raise self.fails
+        self.failsafe.left("radio", self.frame(self.command), self.now)
+
+
+async def test_the_robot_of_a_program_that_vanished_is_stopped_once() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    assert await lab.after(60) == 0
+    lab.failsafe.program_gone("p")
+    assert await lab.after(0) == 1
+    assert await lab.after(60) == 1
+
+
+async def test_only_who_moved_it_last_is_missed() -> None:
+    lab = Lab()
+    for program in ("p", "q"):
+        lab.failsafe.program_came(program)
+        lab.moves(program)
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 0
+    lab.failsafe.program_gone("q")
+    assert await lab.after(0) == 1
+
+
+@pytest.mark.parametrize("word", ["qualseunome", "quantoscomandos", "pare"])
+async def test_who_only_asked_or_stopped_it_is_not_missed(word: str) -> None:
+    lab = Lab("program_gone", "link_silent", "broker_stop")
+    lab.failsafe.program_came("p")
+    lab.moves("p", word)
+    lab.failsafe.program_gone("p")
+    await lab.after(60)
+    await lab.failsafe.close()
+    assert lab.stops == 0
+
+
+async def test_a_stop_ends_the_watch() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.moves("p", "pare")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 0
+
+
+async def test_who_goes_in_good_order_is_not_missed() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.program_done("p")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(60) == 0
+    lab.moves("p")
+    assert await lab.after(60) == 0, "what it asked for last may leave later"
+
+
+async def test_a_program_without_the_token_that_it_promises_is_missed_soon() -> None:
+    lab = Lab()
+    lab.moves("p")
+    assert await lab.after(AWAITED_S / 2) == 0
+    assert await lab.after(AWAITED_S) == 1
+
+
+async def test_a_token_may_come_a_little_after_the_call() -> None:
+    lab = Lab()
+    lab.moves("p")
+    lab.failsafe.program_came("p")
+    assert await lab.after(10 * AWAITED_S) == 0
+
+
+async def test_nothing_more_is_sent_for_a_program_that_is_gone() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.failsafe.program_gone("p")
+    with pytest.raises(CallError, match="is gone"):
+        lab.moves("p")
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+
+
+async def test_after_a_trouble_of_the_bus_each_program_has_to_show_itself_again() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.programs_unsure()
+    lab.failsafe.program_came("p")
+    assert await lab.after(2 * AWAITED_S) == 0
+    lab.failsafe.programs_unsure()
+    assert await lab.after(2 * AWAITED_S) == 1
+
+
+async def test_a_robot_that_is_silent_after_it_was_moved_is_stopped() -> None:
+    lab = Lab("link_silent", silent_s=2.0)
+    lab.moves()
+    assert await lab.after(1.5) == 0
+    lab.heard_at = lab.now
+    assert await lab.after(1.5) == 0
+    assert await lab.after(1.0) == 1
+    assert await lab.after(60) == 1
+
+
+async def test_a_robot_whose_link_went_down_is_stopped_when_it_is_open_again_and_only_then() -> None:
+    lab = Lab("link_silent", silent_s=1000)
+    lab.fails = CallError("link_down", "no")
+    lab.moves()
+    lab.failsafe.link_closed("radio")
+    await lab.after(0)
+    lab.fails, before = None, lab.stops
+    lab.failsafe.link_opened("radio")
+    assert await lab.after(0) == before + 1
+    assert await lab.after(60) == before + 1
+
+
+async def test_a_stop_that_did_not_leave_is_tried_again_until_somebody_moves_the_robot() -> None:
+    lab = Lab()
+    lab.fails = CallError("expired", "the link was stuck")
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(0) == 1
+    assert await lab.after(AGAIN_S / 2) == 1
+    assert await lab.after(AGAIN_S) == 2
+    lab.moves()
+    assert await lab.after(10 * AGAIN_S) == 2
+
+
+async def test_the_robot_of_another_broker_is_left_to_it() -> None:
+    lab = Lab()
+    lab.fails = CallError("unknown_robot", "it is elsewhere")
+    lab.moves("p")
+    assert await lab.after(2 * AWAITED_S) == 1
+    assert await lab.after(60) == 1
+
+
+@pytest.mark.parametrize(("text", "to", "stopped"), [
+    ("parafrente 10", MNERIM, 1), ("parafrente 10", EVERYONE, 1), ("buzina", MNERIM, 1),
+    ("parafrente sucesso", MNERIM, 0), ("qualseunome", EVERYONE, 0), ("pare", MNERIM, 0), ("parafrente 1", PC, 0),
+])  # fmt: skip
+async def test_what_other_robots_command_counts_when_the_broker_stops(text: str, to: Address, stopped: int) -> None:
+    lab = Lab()
+    lab.failsafe.left("radio", lab.frame(text, to), lab.now)
+    await lab.failsafe.close()
+    assert lab.stops == stopped
+
+
+async def test_what_stops_the_robot_is_a_stop_whatever_its_word() -> None:
+    lab = Lab(command="descansa")
+    assert lab.failsafe.stops(lab.frame("descansa"))
+    assert not lab.failsafe.stops(lab.frame("parafrente 10"))
+    lab.moves()
+    lab.failsafe.left("radio", lab.frame("descansa"), lab.now)
+    await lab.failsafe.close()
+    assert lab.stops == 0
+
+
+async def test_a_robot_that_never_answers_does_not_keep_a_broker_from_stopping() -> None:
+    lab = Lab()
+    lab.moves()
+    never: Callable[..., Awaitable[None]] = lambda *_: asyncio.sleep(60)  # noqa: E731
+    lab.failsafe._stop = never
+    async with asyncio.timeout(5):
+        await lab.failsafe.close()
