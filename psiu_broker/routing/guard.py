@@ -2,10 +2,10 @@
 
 from collections.abc import Hashable
 from dataclasses import dataclass
-from math import inf
 from typing import Final
 
 from psiu_broker.frame import Address, Frame, Way
+from psiu_broker.routing.limits import Bucket
 from psiu_broker.routing.policy import Rule
 from psiu_broker.routing.verdicts import Verdict
 
@@ -14,26 +14,6 @@ TO_EVERYONE_AT_ONCE: Final = 20
 """As when many robots are switched on together, and each asks who is there."""
 REFUSALS_KEPT: Final = 256
 MINUTE_S: Final = 60.0
-
-
-class Bucket:
-    """Turns that come back at a steady rate, up to `most`."""
-
-    __slots__ = ("_at", "_left", "_most", "_rate")
-
-    def __init__(self, most: float, rate: float) -> None:
-        self._most = self._left = most
-        self._rate = rate
-        self._at = inf
-
-    def take(self, now: float) -> bool:
-        """Use a turn, if there is one. `now` is in seconds on any steady clock."""
-        self._left = min(self._most, self._left + max(now - self._at, 0.0) * self._rate)
-        self._at = now
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True
 
 
 @dataclass(slots=True)
@@ -62,19 +42,19 @@ class Guard:
         """So many new names may come on `link` in a minute; counting goes on where it was when the link was down."""
         if self._limits.get(link) != new_names_per_minute:
             self._limits[link] = new_names_per_minute
-            self._names[link] = Bucket(new_names_per_minute, new_names_per_minute / MINUTE_S)
+            self._names[link] = Bucket(new_names_per_minute / MINUTE_S, new_names_per_minute)
 
     def may_name(self, link: str, now: float) -> bool:
         """Whether one more new name may come on `link` now."""
         bucket = self._names.get(link)
-        return bucket is None or bucket.take(now)
+        return bucket is None or _take(bucket, now)
 
     def may_tell_everyone(self, link: str, now: float) -> bool:
         """Whether one more frame to everyone may come from `link` now."""
         bucket = self._storms.get(link)
         if bucket is None:
-            bucket = self._storms[link] = Bucket(TO_EVERYONE_AT_ONCE, 1 / TO_EVERYONE_EVERY_S)
-        return bucket.take(now)
+            bucket = self._storms[link] = Bucket(1 / TO_EVERYONE_EVERY_S, TO_EVERYONE_AT_ONCE)
+        return _take(bucket, now)
 
     def refused(self, frame: Frame, verdict: Verdict, way: Way, now: float, rule: Rule | None = None) -> None:
         """Note what was turned away, to tell of it."""
@@ -86,3 +66,11 @@ class Guard:
 
     def last_refusal(self, source: Address) -> Refusal | None:
         return self._refusals.get(source)
+
+
+def _take(bucket: Bucket, now: float) -> bool:
+    """Use one turn of `bucket`, if there is one."""
+    if bucket.ready(1, now) > now:
+        return False
+    bucket.spend(1, now)
+    return True
