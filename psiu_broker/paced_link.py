@@ -93,12 +93,13 @@ class PacedLink(Link):
     ) -> None:
         """Make the link, closed.
 
-        `rests` are those of the robots, by number, for which the codec's own is not right.
+        `rests` are those of the robots, by number, for which the codec's own is not right. `call_at` sets a timer
+        by `clock`; default: the event loop's, whose clock that has to be.
 
         Raises:
             EncodeError: a rest does not fit the packets.
         """
-        super().__init__(configuration, codec, hub, ends=ends, clock=clock, call_at=call_at)
+        super().__init__(configuration, codec, hub, ends=ends, clock=clock)
         self._packets = codec()
         self._rests = dict.fromkeys(range(1, self._packets.robots + 1), self._packets.rest) | dict(rests or {})
         self.outbox = SetPoints(self._packets.robots)
@@ -111,6 +112,7 @@ class PacedLink(Link):
         """Until when what waits for a robot in a lane will hold once it is sent."""
         self._held: dict[int, tuple[bytes, float]] = {}
         """What each robot was told last, and until when it holds."""
+        self._call_at = call_at
         self._timer: Timer | None = None
         self._stops = self._packets.packet([self._rests[robot].stop for robot in sorted(self._rests)])
 
@@ -137,7 +139,7 @@ class PacedLink(Link):
             log.debug("%s: %s", self.name, error)
             return REFUSED
         hold_s = self._rests[robot].hold_s
-        expires = now + min(self._max_age_s, patience_s, hold_s)
+        expires = now + min(self.configuration.options.max_age_s, patience_s, hold_s)
         # A set-point is no question, whatever its word; there is room for a stop and one other.
         parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), now, expires, fate or Fate(frame, arrived))
         superseded = self.outbox.replace(parcel)
@@ -197,7 +199,7 @@ class PacedLink(Link):
         for robot, parcel in due.items():
             self._held[robot] = parcel.wire, self._ages[robot, parcel.lane]
             self._sent(parcel.fate.frame, wire, parcel.peer if parcel.peer in took else took[0], now)
-            self.delays.note(self.frames_out, now - parcel.since)
+            self.outbox.delays.note(self.frames_out, now - parcel.since)
             self._hub.settled(parcel.fate, DELIVERED, now)
         if not due and self._hub.bus.raw_listened:
             self._hub.sent(Frame(NOBODY, EVERYONE, PACKET, b"", self.codec.protocol), wire, Way(self.name, took[0]))

@@ -81,7 +81,9 @@ class Report:
         return [self._link(link, robots) for link in self._exchange.links.values()]
 
     def _link(self, link: Link, robots: Sequence[table.Route]) -> LinkMessage:
-        p50, p99 = (None if ms is None else round(ms, 3) for ms in link.delays.ms(link.frames_out) or (None, None))
+        p50, p99 = (
+            None if ms is None else round(ms, 3) for ms in link.outbox.delays.ms(link.frames_out) or (None, None)
+        )
         return LinkMessage(
             name=link.name,
             adapter=link.configuration.adapter_name,

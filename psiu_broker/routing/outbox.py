@@ -6,6 +6,7 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 from psiu_broker.frame import EVERYONE, Frame, Way
+from psiu_broker.routing.delays import Delays
 from psiu_broker.routing.verdicts import DELIVERED, Verdict
 
 STOP_LANE: Final = 0
@@ -92,12 +93,14 @@ class Outbox:
     Every parcel that goes in comes out exactly once: taken, evicted, expired or cleared.
     """
 
-    __slots__ = ("_capacity", "_lanes", "size")
+    __slots__ = ("_capacity", "_lanes", "delays", "size")
 
     def __init__(self, capacity: int = 64) -> None:
         self._capacity = capacity
         self._lanes: tuple[deque[Parcel], ...] = (deque(), deque(), deque())
         self.size = 0
+        self.delays = Delays()
+        """How long what left had waited, by the number of the frame."""
 
     def __iter__(self) -> Iterator[Parcel]:
         """What waits, in the order in which it would leave."""
