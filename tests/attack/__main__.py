@@ -1,0 +1,78 @@
+"""Attack everything that hears strangers, guided by coverage: python -m tests.attack --seconds 60"""
+
+import importlib.util
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import click
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from attack.corpus import keep, kept
+from attack.targets import TARGETS
+
+ROOT: Final = Path(__file__).parents[2]
+LONGEST: Final = 2048
+"""Bytes of an input: two of the longest frames and some."""
+SLOWEST_S: Final = 10
+"""What one input may take at most, on however slow a machine."""
+MEMORY_MIB: Final = 1024
+
+_DONE: Final = re.compile(r"Done (\d+) runs in (\d+) second")
+_COVERED: Final = re.compile(r"cov: (\d+)")
+
+
+@click.command()
+@click.option("--seconds", type=click.IntRange(1), default=60, help="For all targets together; 60 by default.")
+@click.option("--keep", "keeping", is_flag=True, help="Keep the inputs that reached something new in the corpus.")
+@click.argument("targets", nargs=-1, type=click.Choice(list(TARGETS)))
+def main(seconds: int, keeping: bool, targets: Sequence[str]) -> None:
+    """Attack TARGETS, or all; 1 if an input did what it must not."""
+    if importlib.util.find_spec("atheris") is None:
+        raise click.ClickException("atheris is not installed; it is in the extra fuzz, for Python 3.11 to 3.13")
+    names = targets or list(TARGETS)
+    each_s = max(1, seconds // len(names))
+    broken = [name for name in names if not _attack(name, each_s, keeping=keeping)]
+    if broken:
+        raise click.ClickException(f"broken: {', '.join(broken)}")
+
+
+def _attack(name: str, seconds: int, *, keeping: bool) -> bool:
+    with tempfile.TemporaryDirectory() as made:
+        found, known, artifacts = (Path(made) / part for part in ("found", "known", "artifacts"))
+        for folder in (found, known, artifacts):
+            folder.mkdir()
+        for number, data in enumerate(kept(name)):
+            (known / f"{number}").write_bytes(data)
+        run = _fuzz(
+            name, found, known, f"-max_total_time={seconds}", f"-max_len={LONGEST}", f"-timeout={SLOWEST_S}",
+            f"-rss_limit_mb={MEMORY_MIB}", f"-artifact_prefix={artifacts}/",
+        )  # fmt: skip
+        done, covered = _DONE.search(run.stderr), _COVERED.findall(run.stderr)
+        if run.returncode or done is None:
+            print(run.stdout, run.stderr, sep="\n")
+            for artifact in artifacts.iterdir():
+                print(f"{name}: {artifact.name.partition('-')[0]} by {artifact.read_bytes().hex()}")
+            return False
+        new = len(list(found.iterdir()))
+        print(
+            f"{name:12} {int(done[1]):>10,} inputs in {done[2]:>4} s, {covered[-1]} places reached, {new} inputs new",
+            flush=True,
+        )
+        if keeping:
+            keep(name, [*kept(name), *(file.read_bytes() for file in found.iterdir())])
+        return True
+
+
+def _fuzz(name: str, *arguments: Path | str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.attack.fuzzer", name, *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, errors="replace", check=False)
+
+
+if __name__ == "__main__":
+    main()
