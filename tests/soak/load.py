@@ -5,6 +5,7 @@ import contextlib
 import random
 import threading
 from collections import Counter
+from itertools import chain
 from typing import Final
 
 from psiu_broker.bus.client import Client
@@ -15,6 +16,8 @@ from tests.soak.lab import Lab
 
 ORDER_EVERY_S: Final = 0.05
 ORDERS_EACH: Final = 3
+LOST_ROBOT: Final = 0.02
+"""How often somebody is told something who is not there."""
 TROUBLE_EVERY_S: Final = 2.0
 GONE_S: Final = (0.02, 0.3, 2.5)
 FLAPS: Final = 10
@@ -32,8 +35,8 @@ class Caller(threading.Thread):
         self.outcomes: Counter[str] = Counter()
         self.ending = threading.Event()
         self._endpoint = endpoint
-        self._calls = lab.calls
-        self._random = random.Random(seed)
+        luck = random.Random(seed)
+        self._next = chain(lab.calls, iter(lambda: luck.choice(lab.calls), None))
 
     def run(self) -> None:
         while not self.ending.is_set():
@@ -43,7 +46,7 @@ class Caller(threading.Thread):
     def _call(self, client: Client) -> None:
         """Until the session is lost, as happens where a machine has too much to do."""
         while not self.ending.wait(CALL_EVERY_S):
-            call = self._random.choice(self._calls)
+            call = next(self._next)
             request = CallRequest(parameters=list(call.parameters), timeout_s=CALL_S)
             try:
                 client.call(call.robot, call.command, request)
@@ -66,8 +69,11 @@ class Trouble:
         self.done: Counter[str] = Counter()
         self._lab = lab
         self._random = random.Random(seed)
-        # Few pairs: the broker remembers each for a while, and is warm only once it has seen them all.
-        self._orders = {robot.name: self._random.sample(lab.calls, ORDERS_EACH) for _, robot in lab.speakers}
+        # Few pairs: the bus keeps something ready for each of the last 1024.
+        self._orders = {
+            robot.name: self._random.sample([call for call in lab.calls if call.robot != robot.name], ORDERS_EACH)
+            for _, robot in lab.speakers
+        }
         self._tasks: list[asyncio.Task[None]] = []
 
     def begin(self) -> None:
@@ -82,13 +88,14 @@ class Trouble:
             _plug(port)
 
     async def _order(self) -> None:
-        while True:
-            port, robot = self._random.choice(self._lab.speakers)
-            call = self._random.choice(self._orders[robot.name])
-            name = "NOBODY" if self._random.random() < 0.02 else call.robot
-            if name != robot.name:
-                port.send(robot.command(name, call.command, *call.parameters), robot)
-                self.done["orders"] += 1
+        """Every pair once, so that the broker is warm soon; then at random."""
+        pairs = [(port, robot, call) for port, robot in self._lab.speakers for call in self._orders[robot.name]]
+        for port, robot, call in chain(pairs, iter(lambda: self._random.choice(pairs), None)):
+            if self._random.random() < LOST_ROBOT:
+                speaker, stray = self._lab.speakers[0]
+                speaker.send(stray.command("NOBODY", "parafrente", 1), stray)
+            port.send(robot.command(call.robot, call.command, *call.parameters), robot)
+            self.done["orders"] += 1
             await asyncio.sleep(ORDER_EVERY_S)
 
     async def _break(self) -> None:
