@@ -5,13 +5,14 @@ BIN := .venv/bin
 EXTRAS := test,lint,bluetooth-simulator,hotplug
 CANDIDATES := $(or $(PYTHON),python3 python3.14 python3.13 python3.12 python3.11)
 
-.PHONY: help demo test bench soak mesh-proof mesh-scale lint clean
+.PHONY: help demo test bench soak faults mesh-proof mesh-scale lint clean
 
 help:
 	@echo "make demo    a broker and simulated robots of every protocol, for a look"
 	@echo "make test    all tests"
 	@echo "make bench   the figures of the README"
 	@echo "make soak    a broker under load and faults for long: MINUTES=10; fails if it uses more and more"
+	@echo "make faults  every fault on every kind of link, and how long it takes to recover; as root for all"
 	@echo "make mesh-proof   how the mesh heals, as root: EVENTS=100 a network, SEED=1"
 	@echo "make mesh-scale   how the mesh grows from 5 to 50 brokers, simulated"
 	@echo "make lint    ruff, mypy, the import rules"
@@ -28,6 +29,9 @@ bench: .venv/.ready
 
 soak: .venv/.ready
 	@$(BIN)/python -m tests.soak --minutes $(or $(MINUTES),10) --seed $(or $(SEED),1)
+
+faults: .venv/.ready
+	@PSIU_FAULTS=all $(BIN)/pytest tests/system/faults -q -s $(PYTEST_ARGS)
 
 mesh-proof: .venv/.ready
 	@PSIU_MESH_EVENTS=$(or $(EVENTS),100) PSIU_MESH_SEED=$(or $(SEED),$$(date +%s)) \

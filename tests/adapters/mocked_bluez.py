@@ -135,15 +135,35 @@ class Bluetooth:
         if self._bus is not None:
             self._bus.disconnect()
             await self._bus.wait_for_disconnect()
+            self._bus = None
+
+    async def end(self) -> None:
+        """The bus dies, and bluetoothd with it."""
+        await self.close()
+        self.bus_daemon.kill()
+        await asyncio.to_thread(self.bus_daemon.wait)
+
+    async def again(self) -> None:
+        """The bus starts anew, without bluetoothd."""
+        with self.bus_daemon:  # which has ended
+            self.bus_daemon = await asyncio.to_thread(bus_daemon, self.folder.parent)
+
+
+def bus_daemon(folder: Path) -> subprocess.Popen[str]:
+    """A D-Bus of its own at `folder`/bus, which is ready."""
+    address = f"unix:path={folder}/bus"
+    command = ["dbus-daemon", "--session", "--nofork", "--print-address=1", f"--address={address}"]
+    daemon = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert daemon.stdout is not None
+    daemon.stdout.readline()
+    return daemon
 
 
 @contextlib.contextmanager
 def system_bus(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[str]]:
     """A private dbus-daemon, which is the system bus meanwhile."""
-    command = ["dbus-daemon", "--session", "--nofork", "--print-address=1", f"--address=unix:path={folder}/bus"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as daemon:
-        assert daemon.stdout is not None
-        monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", daemon.stdout.readline().strip())
+    with bus_daemon(folder) as daemon:
+        monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", f"unix:path={folder}/bus")
         try:
             yield daemon
         finally:
@@ -161,6 +181,8 @@ async def mocked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator
             yield bluetooth
         finally:
             await bluetooth.close()
+            with bluetooth.bus_daemon:  # it may be another one by now
+                bluetooth.bus_daemon.kill()
 
 
 @contextlib.asynccontextmanager
