@@ -85,7 +85,7 @@ async def ask(program: zenoh.Session, key: str, payload: bytes | str | None = No
 
 async def test_a_get_sends_and_waits_for_the_answer(calls: Calls, program: zenoh.Session, robots: Robots) -> None:
     [answer] = await ask(program, "psiu/@call/MNERIM/parafrente", '{"parameters": [100], "timeout_s": 4}')
-    assert answer == {"status": "sucesso", "values": [7, "é"], "unit": None, "elapsed_ms": 12.5}
+    assert answer == {"status": "sucesso", "values": [7, "é"], "unit": None, "remark": None, "elapsed_ms": 12.5}
     request = CallRequest(parameters=[100], timeout_s=4)
     assert robots.called == [(Address.named("MNERIM"), "parafrente", request)]
 

@@ -88,7 +88,18 @@ async def test_lists_are_arrays_and_times_are_rfc_3339(queries: Queries, program
 async def test_wildcards_get_each_answer_on_its_own_key(queries: Queries, program: zenoh.Session) -> None:
     every = {
         f"psiu/@broker/base/{what}"
-        for what in ("status", "links", "trunks", "routes", "ledger", "ledger-of-robots", "health", "mesh", "config")
+        for what in (
+            "status",
+            "links",
+            "trunks",
+            "routes",
+            "ledger",
+            "ledger-of-robots",
+            "health",
+            "mesh",
+            "conflicts",
+            "config",
+        )
     }
     assert set(await ask(program, "psiu/@broker/base/*")) == every
     assert set(await ask(program, "psiu/@broker/**")) == every

@@ -26,6 +26,7 @@ ON_THE_BUS = (
     "mesh",
     "conflicts",
     "ledger",
+    "ping",
     "status",
 )
 ALONE = ("decode", "encode", "sim", "schema")
