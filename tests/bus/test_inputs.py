@@ -1,0 +1,131 @@
+"""What comes from the bus as JSON, made from the schemas that programs are told: taken, or refused as declared."""
+
+import json
+from functools import partial
+from typing import Any, Final
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+from mesh.simulated import Simulation
+from pydantic import BaseModel, ValidationError
+from schema_values import values_of
+
+from psiu_broker.bus.calls import read_request
+from psiu_broker.errors import CallError
+from psiu_broker.mesh.beat import Beat, Notice
+from psiu_broker.mesh.probe import Probed
+from psiu_broker.messages import PUBLISHED, CallRequest
+from psiu_broker.protocols import PROTOCOLS
+
+MODELS: Final[tuple[type[BaseModel], ...]] = (*PUBLISHED, Beat, Notice, Probed)
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=10), inner, max_size=4),
+    max_leaves=12,
+)
+fits = partial(settings, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+
+
+def schema_of(model: type[BaseModel]) -> dict[str, Any]:
+    return model.model_json_schema()
+
+
+@given(request=values_of(schema_of(CallRequest)))
+@fits(max_examples=100)
+def test_a_request_that_fits_the_schema_is_taken(request: dict[str, Any]) -> None:
+    taken = read_request(json.dumps(request).encode())
+    assert taken.parameters == request.get("parameters", [])
+
+
+@given(
+    request=values_of(schema_of(CallRequest)), name=st.sampled_from(["parameters", "timeout_s", "x"]), value=anything
+)
+@fits(max_examples=200)
+def test_a_request_that_does_not_fit_is_refused_in_words(request: dict[str, Any], name: str, value: object) -> None:
+    payload = json.dumps(request | {name: value}).encode()
+    try:
+        read_request(payload)
+    except CallError as error:
+        assert error.code == "bad_request"
+    else:
+        assert not list(Draft202012Validator(schema_of(CallRequest)).iter_errors(json.loads(payload)))
+
+
+@given(
+    payload=st.one_of(
+        st.binary(max_size=60), st.text(max_size=60).map(str.encode), anything.map(json.dumps).map(str.encode)
+    )
+)
+@fits(max_examples=200)
+def test_no_payload_raises_what_is_not_declared(payload: bytes) -> None:
+    try:
+        read_request(payload)
+    except CallError as error:
+        assert error.code == "bad_request"
+
+
+@pytest.mark.parametrize(
+    "payload", [b"[" * 60_000, b'{"parameters":' * 4000, b'{"parameters":[' + b"9" * 60_000 + b"]}"]
+)
+def test_nested_and_endless_payloads_are_refused(payload: bytes) -> None:
+    with pytest.raises(CallError):
+        read_request(payload)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_no_profile_raises_at_what_fits_the_schema_but_a_call_error(protocol: str) -> None:
+    entry = PROTOCOLS[protocol]
+    profile = entry.profile.make(entry.codec.Options(), entry.profile.Options(), 1.0)
+    commands = st.sampled_from([command.name for command in profile.commands()]) | st.text(max_size=12)
+
+    @given(request=values_of(schema_of(CallRequest)), command=commands)
+    @fits(max_examples=60)
+    def called(request: dict[str, Any], command: str) -> None:
+        try:
+            asked = profile.request(command, read_request(json.dumps(request).encode()).parameters)
+        except CallError:
+            return
+        profile.answers_to(asked)
+
+    called()
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.__name__)
+def test_of_each_message_whatever_fits_its_schema_is_read_and_the_rest_refused(model: type[BaseModel]) -> None:
+    @given(value=values_of(schema_of(model)) | anything)
+    @fits(max_examples=25)
+    def came(value: object) -> None:
+        try:
+            model.model_validate_json(json.dumps(value))
+        except ValidationError:
+            return
+
+    came()
+
+
+@given(
+    beats=st.lists(values_of(schema_of(Beat)), max_size=3),
+    notices=st.lists(values_of(schema_of(Notice)), max_size=3),
+    broker=st.sampled_from(["A", "B", "C"]),
+)
+@fits(max_examples=25)
+def test_whatever_beats_and_notices_come_the_mesh_goes_on(
+    beats: list[dict[str, Any]], notices: list[dict[str, Any]], broker: str
+) -> None:
+    simulation = Simulation(("A", "B"))
+    simulation.run(1)
+    mesh = simulation.stations["A"].mesh
+    for told in beats:
+        try:
+            mesh.beat_came(Beat.model_validate_json(json.dumps(told | {"broker": broker})), simulation.now)
+        except ValidationError:
+            continue
+    for told in notices:
+        try:
+            mesh.notice_came(Notice.model_validate_json(json.dumps(told | {"broker": broker})), simulation.now)
+        except ValidationError:
+            continue
+    simulation.run(1)
