@@ -70,9 +70,9 @@ def world() -> World:
     return World()
 
 
-async def test_a_robot_of_our_own_is_asked_its_name(world: World) -> None:
+async def test_a_robot_of_our_own_is_asked_what_moves_nothing(world: World) -> None:
     trace = await world.tracing.trace(BETA, MNERIM, world.probe)
-    assert world.asked == [(MNERIM, "qualseunome")]
+    assert world.asked == [(MNERIM, "quantoscomandos")]
     assert (trace.a, trace.b, trace.answered, trace.total_ms) == ("BETA", "MNERIM", True, 10)
     assert [(hop.at, hop.event, hop.elapsed_ms) for hop in trace.hops] == [
         ("base", "sent", 0),

@@ -92,9 +92,9 @@ def why(connection: Connection, a: str, b: str, broker: str | None) -> None:
 def trace(connection: Connection, a: str, b: str) -> None:
     """Have the broker that A is on ask robot B a harmless question, and show its way with times.
 
-    B is asked for its name, or pinged; nothing moves. A is a robot or a broker. In a pipe each line has, between
-    tabs: ms since the question left, where, what happened there. With --json: a list (psiu schema Trace). The exit
-    code is 3 if B did not answer; one line on stderr says why.
+    B is asked how many commands it has, or pinged; nothing moves. A is a robot or a broker. In a pipe each line has,
+    between tabs: ms since the question left, where, what happened there. With --json: a list (psiu schema Trace).
+    The exit code is 3 if B did not answer; one line on stderr says why.
     """
     with connection.client() as client:
         told = client.ask("trace", a, b, timeout_s=TRACE_TIMEOUT_S)

@@ -38,9 +38,9 @@ _UNASKED: Final[frozenset[CallCode]] = frozenset({"bad_request", "unknown_comman
 def ping(connection: Connection, robot: str, count: int | None, every_s: float) -> None:
     """Ask ROBOT something harmless every second, and tell how long each answer took.
 
-    PSIU HEXA robots are pinged, PSIU ASCII robots asked their names, others what moves nothing. Nothing is asked
-    twice: silence counts as a loss. At the end, also after Ctrl-C, come the loss and the least, the median and the
-    longest time.
+    PSIU HEXA robots are pinged, PSIU ASCII robots asked how many commands they have, others what moves nothing.
+    Nothing is asked twice: silence counts as a loss. At the end, also after Ctrl-C, come the loss and the least, the
+    median and the longest time.
 
     The exit code is 0 if there was an answer, else 3. With --json: a line a question, {"n", "elapsed_ms"} or {"n",
     "error", "message"}, and at the end {"robot", "sent", "answered", "loss", "min_ms", "median_ms", "max_ms"}.

@@ -146,7 +146,7 @@ class PsiuProfile(Profile):
     """
 
     protocol = "psiu-ascii"
-    harmless = NAME
+    harmless = COUNT  # a question for the name looks like an answer to one
     Options = PsiuOptions
 
     def __init__(

@@ -19,7 +19,7 @@ def test_each_robot_is_asked_what_harms_nothing(lab: Any) -> None:
     for robot in ("BETA", "BRACO", "base", "MNERIM"):
         lines = lab.run("ping", robot, "--count", "1", "--json").stdout.splitlines()
         answer, end = map(json.loads, lines)
-        assert answer.keys() == {"n", "elapsed_ms"}
+        assert answer.keys() == {"n", "elapsed_ms"}, (robot, answer)
         assert end.items() >= {"robot": robot, "sent": 1, "answered": 1, "loss": 0.0}.items()
         assert end["min_ms"] == end["median_ms"] == end["max_ms"] == answer["elapsed_ms"]
 

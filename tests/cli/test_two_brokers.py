@@ -103,7 +103,7 @@ def test_why_goes_from_broker_to_broker(brokers: Brokers) -> None:
 def test_a_trace_shows_the_way_there_and_back(brokers: Brokers) -> None:
     (told,) = brokers.json("trace", "MNERIM", "BETA")
     trace = Trace.model_validate(told)
-    assert (trace.question, trace.answered) == ("qualseunome", True)
+    assert (trace.question, trace.answered) == ("quantoscomandos", True)
     assert [(hop.at, hop.event) for hop in trace.hops] == [
         ("base", "sent"),
         ("north", "received"),
