@@ -32,3 +32,11 @@ def test_the_growth_of_the_mesh_is_printed() -> None:
     assert bench.returncode == 0, bench.stdout + bench.stderr
     assert "How the mesh grows" in bench.stdout
     assert "4 brokers: beats (N-1)/0.4 s = 7.5 msg/s" in bench.stdout
+
+
+def test_what_a_byte_costs_each_codec_is_printed() -> None:
+    command = [sys.executable, "-m", "tests.bench.cost_per_byte", "--quick"]
+    bench = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert bench.returncode == 0, bench.stdout + bench.stderr
+    for codec in ("psiu-ascii,", "psiu-ascii 0.5,", "psiu-hexa,", "mitya,", "soccer,", "firmata,", "amarino,"):
+        assert codec in bench.stdout
