@@ -91,8 +91,10 @@ class CallRequest(Message):
 
     # Strict: true is no number.
     parameters: list[StrictInt | StrictFloat | StrictStr] = Field(default=[], max_length=64)
-    timeout_s: float | None = Field(default=None, gt=0, le=3600)
-    retries: int | None = Field(default=None, ge=0, le=100, description="how often a question may be asked again")
+    timeout_s: float | None = Field(default=None, gt=0, le=3600, strict=True)
+    retries: int | None = Field(
+        default=None, ge=0, le=100, strict=True, description="how often a question may be asked again"
+    )
     program: str | None = Field(
         default=None,
         pattern=r"^[A-Za-z0-9_.-]+$",

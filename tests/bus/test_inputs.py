@@ -54,6 +54,14 @@ def test_a_request_that_does_not_fit_is_refused_in_words(request: dict[str, Any]
         assert not list(Draft202012Validator(schema_of(CallRequest)).iter_errors(json.loads(payload)))
 
 
+@pytest.mark.parametrize(
+    "payload", [b'{"timeout_s": true}', b'{"timeout_s": "5"}', b'{"retries": true}', b'{"retries": "2"}']
+)
+def test_what_only_looks_like_a_number_is_none(payload: bytes) -> None:
+    with pytest.raises(CallError, match="expected"):
+        read_request(payload)
+
+
 @given(
     payload=st.one_of(
         st.binary(max_size=60), st.text(max_size=60).map(str.encode), anything.map(json.dumps).map(str.encode)
