@@ -4,7 +4,7 @@ A frame that is offered waits for the next packet and is delivered with it. Its 
 every packet, until a newer one comes or it is too old; then, and while nobody has told the robot anything,
 its share is what stops it. So the packets go on, whether there is news or not, for as long as the link is
 open: from its opening, or, where the codec is not `steady`, from the first set-point that it was ever
-offered. The last packet before the link is closed stops every robot.
+offered. The last packet before the link is closed stops every robot, if the line has room for it.
 
 A line is one team: the packet goes to all its far ends, and a robot is known by its number alone.
 """
@@ -143,6 +143,8 @@ class PacedLink(Link):
         # A set-point is no question, whatever its word; there is room for a stop and one other.
         parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), now, expires, fate or Fate(frame, arrived))
         superseded = self.outbox.replace(parcel)
+        if parcel.lane < COMMAND_LANE:
+            self._held.pop(robot, None)  # whatever becomes of the stop, the robot does not go on
         self._ages[robot, parcel.lane] = now + hold_s
         self._empty.clear()
         for older in superseded:

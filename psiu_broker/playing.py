@@ -295,7 +295,7 @@ class Program:
                 answer = await self._robots.call(self.robot, call.command, request, asked.at, self._caller)
             else:
                 await self._robots.tell(self.robot, call.command, request, asked.at, self._caller)
-        except (CallError, ValueError) as failure:
+        except (CallError, ValueError, OverflowError) as failure:
             error = str(failure)
             log.debug("%s told %s %s: %s", self._address, self.robot, call.command, error)
         if error or answer is not None:

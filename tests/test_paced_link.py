@@ -366,6 +366,18 @@ def test_whoever_sends_without_pause_does_not_undo_a_stop() -> None:
     assert lab.hub.verdicts == ["superseded", "superseded", "delivered", "delivered"]
 
 
+def test_a_stop_that_found_no_room_in_time_stops_its_robot_all_the_same() -> None:
+    lab = Lab(hold_s=60.0).open()
+    lab.offer(set_point(ONE, 15, 15))
+    lab.clock.slots()
+    lab.transport.full = True
+    lab.offer(pare(ONE), patience_s=0.05)
+    lab.clock.slots(5)
+    lab.transport.full = False
+    lab.clock.slots()
+    assert (lab.hub.verdicts, lab.packets[-1]) == (["delivered", "expired"], STOPPED)
+
+
 def test_a_newer_stop_takes_the_place_of_all_that_waits_for_its_robot_alone() -> None:
     lab = Lab().open()
     lab.offer(pare(ONE))

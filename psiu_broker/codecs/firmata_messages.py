@@ -357,8 +357,14 @@ def _read_short(wire: bytes) -> Message | None:
     return None
 
 
+_LONGEST_VALUE: Final = 5
+"""Seven-bit bytes of a value; no pin has more than 32 bits."""
+
+
 def _read_sysex(command: int, data: bytes) -> Message | None:  # noqa: PLR0911 - one for each message
     match command, *data:
+        case (0x6F | 0x6E, *_) if len(data) > _LONGEST_VALUE + 2:
+            return None
         case (0x6F, pin, _, *_):
             return AnalogMessage(pin, from_seven_bit(data[1:]))
         case (0x79, major, minor, *_):

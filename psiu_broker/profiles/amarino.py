@@ -164,8 +164,10 @@ class AmarinoProfile(Profile):
         if named is not None:
             try:
                 message = named.flag + named.text(parameters)
-            except ValueError as error:
-                why = str(error) or f"it takes {named.takes}, got {_shown(parameters)}"
+            except (ValueError, OverflowError) as error:
+                why = (
+                    str(error) if isinstance(error, ValueError) else ""
+                ) or f"it takes {named.takes}, got {_shown(parameters)}"
                 raise CallError("refused", f"{command}: {why}") from None
         elif command == SEND:
             message = _raw(parameters)

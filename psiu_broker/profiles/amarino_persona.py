@@ -32,6 +32,7 @@ __all__ = ["AmarinoPersona", "FlagRule"]
 COMPLAIN_EVERY_S: Final = 5.0
 """A phone streams its sensors: it hears of one trouble with one flag only once in a while."""
 
+_NUMBERS: Final = re.compile(r"[-+.\d]+")
 _UNSAYABLE: Final = re.compile(r"[;\x11-\x13\x1b]")
 
 
@@ -134,7 +135,8 @@ class AmarinoPersona(Persona):
         return _say([*words, *told]) if words or told else ()
 
     def _complain(self, frame: Frame, texts: Sequence[str], now: float) -> Sequence[Say]:
-        if not self._rarely.may((frame.payload[:1], texts[0]), now, COMPLAIN_EVERY_S):
+        trouble = _NUMBERS.sub("", texts[0])
+        if not self._rarely.may((frame.payload[:1], trouble), now, COMPLAIN_EVERY_S):
             return ()
         return [Say(TEXT, text.encode("utf-8", "replace")) for text in texts]
 

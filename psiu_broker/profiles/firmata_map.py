@@ -49,11 +49,19 @@ class PlayedPin(BaseModel):
     )
     off: tuple[Word, ...] | None = Field(None, description="output: the parameters for off, 0 unless told")
     before: tuple[Word, ...] = Field((), description="parameters before the value, or those of a question")
-    scale: float = Field(1, description="the robot's value is the pin's times this; a reading times this is the pin's")
-    offset: float = Field(0, description="what is added after `scale`")
+    scale: float = Field(
+        1,
+        allow_inf_nan=False,
+        description="the robot's value is the pin's times this; a reading times this is the pin's",
+    )
+    offset: float = Field(0, allow_inf_nan=False, description="what is added after `scale`")
     decimals: int = Field(0, ge=0, le=6, description="digits behind the point of the robot's value; 0: whole numbers")
-    minimum: float | None = Field(None, description="a smaller value is refused, in the robot's unit")
-    maximum: float | None = Field(None, description="a greater value is refused, in the robot's unit")
+    minimum: float | None = Field(
+        None, allow_inf_nan=False, description="a smaller value is refused, in the robot's unit"
+    )
+    maximum: float | None = Field(
+        None, allow_inf_nan=False, description="a greater value is refused, in the robot's unit"
+    )
     reading: str | None = Field(None, min_length=1, description="what the pin reads, by the name that the robot tells")
     ask: str | None = Field(None, min_length=1, description="the question for it, if it is not named as the reading")
     poll_s: float | None = Field(

@@ -71,13 +71,15 @@ Actions = list[Say | Call]
 class _State:
     """What a pin is at the moment."""
 
-    __slots__ = ("chosen", "mode", "pending", "pulses", "reported_at", "reporting", "value", "written")
+    __slots__ = ("chosen", "mode", "pending", "pulses", "reported_at", "reporting", "unsure", "value", "written")
 
     def __init__(self, mode: int) -> None:
         self.mode = mode
         self.chosen = False
         """Whether the program chose the mode; a pin that it never spoke of is not touched with the rest of its port."""
         self.written: int | None = None
+        self.unsure = False
+        """What was written last did not reach the robot."""
         self.value: int | None = None
         """What it reads; None: the robot has not said."""
         self.reporting = False
@@ -168,7 +170,7 @@ class FirmataPersona(Persona):
         for number, pin in self._layout.pins.items():
             if pin.command == call.command:
                 # It is not as it was written, so that writing the same again is worth a call.
-                self._states[number].written = None
+                self._states[number].unsure = True
         return self._complain(call.command, failed, now)
 
     def told(self, description: Description, now: float) -> Sequence[Say]:
@@ -229,7 +231,7 @@ class FirmataPersona(Persona):
         actions: Actions = []
         for number, state in self._states.items():
             pin = self._layout.pins.get(number)
-            if pin is not None and pin.mode != "servo" and state.written:
+            if pin is not None and pin.mode != "servo" and (state.written or state.unsure):
                 actions += self._level(pin, number, 0, 0.0)
         self._begin()
         return actions
@@ -240,11 +242,15 @@ class FirmataPersona(Persona):
         state = self._states.get(number)
         if state is None or mode not in self._layout.modes(number):
             return [*self._complain(number, f"{self._pin(number)} cannot be {mode_name(mode)}", now)]
+        actions: Actions = []
         if state.mode != mode:
+            pin = self._layout.pins.get(number)
+            if pin is not None and pin.mode != "servo" and (state.written or state.unsure):
+                actions = self._level(pin, number, 0, now)  # as a board does: what was driven goes off
             state.mode = mode
             state.written = None
         state.chosen = True
-        return []
+        return actions
 
     def _write(self, number: int, value: int, now: float) -> Actions:
         """A level or an angle; it counts whatever mode the program forgot to set."""
@@ -267,9 +273,8 @@ class FirmataPersona(Persona):
             state = self._states.get(number)
             if state is None or number not in self._layout.pins or state.mode != MODES["output"]:
                 continue
-            if (state.written is None and (on or state.chosen)) or (
-                state.written is not None and on != bool(state.written)
-            ):
+            known = state.written is not None and not state.unsure
+            if on != bool(state.written) if known else on or state.chosen or state.unsure:
                 actions += self._switch(number, bool(on), now)
         return actions
 
@@ -287,6 +292,7 @@ class FirmataPersona(Persona):
         except ValueError as error:
             return [*self._complain(number, str(error), now)]
         self._states[number].written = value
+        self._states[number].unsure = False
         # Two pins with one command would else count as set-points of each other.
         return [Call(pin.command, parameters, newest=self._shared[pin.command] == 1)]
 

@@ -27,9 +27,13 @@ class Pin(BaseModel):
         description="its number, or A0 to A15 for an analog channel"
     )
     mode: PinModeName = Field(description="what it is; pullup is an input that reads 1 with nothing connected")
-    minimum: float | None = Field(None, description="pwm, servo: the least value to allow, in the pin's unit")
+    minimum: float | None = Field(
+        None, allow_inf_nan=False, description="pwm, servo: the least value to allow, in the pin's unit"
+    )
     maximum: float | None = Field(
-        None, description="pwm, servo: the greatest value to allow; a servo goes to 180 unless told"
+        None,
+        allow_inf_nan=False,
+        description="pwm, servo: the greatest value to allow; a servo goes to 180 unless told",
     )
     scale: float | None = Field(
         None, description="pwm, servo, analog: value = scale * (what is on the wire) + offset; 1 unless told"
