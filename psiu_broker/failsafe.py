@@ -17,7 +17,7 @@ from psiu_broker.config.tables import FailsafeConfiguration
 from psiu_broker.errors import CallError
 from psiu_broker.frame import EVERYONE, Address, Frame
 from psiu_broker.profiles.profile import Profile, Request
-from psiu_broker.routing.outbox import is_stop
+from psiu_broker.routing.outbox import STOP_LANE, lane
 
 AWAITED_S: Final = 1.0
 """How long a program may take to show the token that its calls promise, or, after a trouble of the bus, again."""
@@ -120,6 +120,8 @@ class Failsafe:
         _, request, program = self._offered.pop(id(frame), (frame, None, None))
         for ward in self._told(link, frame.destination):
             if self._is_stop(ward, frame):
+                if frame.destination == EVERYONE:
+                    continue  # robots take no heed of it
                 ward.moved_at, ward.program, ward.due = -inf, None, ""
             elif not request.question if request is not None else self._moves(ward, frame):
                 self._note(ward, program, now)
@@ -201,7 +203,7 @@ class Failsafe:
         return () if ward is None else (ward,)
 
     def _is_stop(self, ward: Ward, frame: Frame) -> bool:
-        return is_stop(frame.subject) or (frame.subject, frame.payload) == self._asked_of(ward)
+        return lane(frame) == STOP_LANE or (frame.subject, frame.payload) == self._asked_of(ward)
 
     def _asked_of(self, ward: Ward) -> tuple[str, bytes]:
         profile = self._profile(ward.robot)

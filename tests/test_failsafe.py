@@ -104,6 +104,16 @@ async def test_a_stop_ends_the_watch() -> None:
     assert await lab.after(1) == 0
 
 
+@pytest.mark.parametrize(("text", "to"), [("pare sucesso", MNERIM), ("pare", EVERYONE)])
+async def test_neither_an_answer_nor_a_stop_to_everyone_ends_the_watch(text: str, to: Address) -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.left("radio", lab.frame(text, to), lab.now)
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 1
+
+
 async def test_who_goes_in_good_order_is_not_missed() -> None:
     lab = Lab()
     lab.failsafe.program_came("p")

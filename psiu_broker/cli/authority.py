@@ -29,11 +29,13 @@ class Authority:
 
         Raises:
             OSError: a file cannot be read or written.
-            ValueError: ca.pem or ca.key is none.
+            ValueError: ca.pem or ca.key is none, or only the key is there.
         """
         self.folder = folder
         self._now = now or datetime.now(UTC)
         self.is_new = not (folder / "ca.pem").exists()
+        if self.is_new and (folder / "ca.key").exists():
+            raise ValueError(f"{folder / 'ca.key'} is there without ca.pem; put that back, or take both away")
         if self.is_new:
             folder.mkdir(parents=True, exist_ok=True)
             self._key = ec.generate_private_key(ec.SECP256R1())

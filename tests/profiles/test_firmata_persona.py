@@ -298,6 +298,16 @@ class TestOutcome:
         board.persona.answered(call, None, "link_down", board.now)
         assert board.hears(DigitalMessage(1, 1 << 5)) == [call]
 
+    def test_what_could_not_be_switched_off_is_switched_off_by_the_next_word(self, board: Board) -> None:
+        board.hears(PinMode(13, 1))
+        board.hears(DigitalMessage(1, 1 << 5))
+        (off,) = board.hears(DigitalMessage(1, 0))
+        assert isinstance(off, Call)
+        board.persona.answered(off, None, "queue_full", board.now)
+        assert board.hears(DigitalMessage(1, 0)) == [off]
+        board.persona.answered(off, None, "queue_full", board.now)
+        assert off in board.hears(RESET_MESSAGE)
+
 
 class TestReading:
     def test_nothing_is_reported_before_it_is_wanted_or_known(self, board: Board) -> None:
