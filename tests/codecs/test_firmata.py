@@ -379,3 +379,9 @@ def test_a_byte_of_a_long_input_costs_no_more_than_one_of_a_short_input(pattern:
         return min(costs)
 
     assert cost_s(256_000, 1) < 16 * cost_s(4_000, 20)
+
+
+@pytest.mark.parametrize("head", [(0x6E, 3, 3), (0x6F, 3)])
+def test_a_value_of_more_bits_than_any_pin_has_is_none(head: tuple[int, ...]) -> None:
+    assert fm.read(bytes((0xF0, *head)) + b"\x7f" * 5 + b"\xf7") is not None
+    assert fm.read(bytes((0xF0, *head)) + b"\x7f" * 4000 + b"\xf7") is None

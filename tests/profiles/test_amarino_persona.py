@@ -88,6 +88,13 @@ def test_a_phone_that_streams_hears_of_one_trouble_once_in_a_while() -> None:
     assert len(played.heard(frame, 1.0 + COMPLAIN_EVERY_S)) == 1
 
 
+def test_a_stream_of_other_and_other_wrong_values_is_one_trouble() -> None:
+    played = AmarinoPersona(
+        "MNERIM", None, AmarinoPersona.Options.model_validate({"A": {"command": "brilho", "scale": 1, "maximum": 10}})
+    )
+    assert sum(len(played.heard(phone(b"A%d\x13" % value), 0.0)) for value in range(100, 1100)) == 1
+
+
 @pytest.mark.parametrize(
     ("answer", "text"),
     [

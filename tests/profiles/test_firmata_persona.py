@@ -298,6 +298,11 @@ class TestOutcome:
         board.persona.answered(call, None, "link_down", board.now)
         assert board.hears(DigitalMessage(1, 1 << 5)) == [call]
 
+    def test_what_a_pin_drove_goes_off_when_it_becomes_something_else(self, board: Board) -> None:
+        board.hears(PinMode(13, 1))
+        board.hears(DigitalMessage(1, 1 << 5))
+        assert board.hears(PinMode(13, 0)) == [Call("farol", (0,), newest=True)]
+
     def test_what_could_not_be_switched_off_is_switched_off_by_the_next_word(self, board: Board) -> None:
         board.hears(PinMode(13, 1))
         board.hears(DigitalMessage(1, 1 << 5))
