@@ -126,6 +126,16 @@ def test_a_folder_without_the_authority_s_key_makes_none(daemon: Run, tmp_path: 
     assert not (tmp_path / "hill.key").exists()
 
 
+def test_an_authority_s_key_without_its_certificate_is_left_as_it_is(daemon: Run, tmp_path: Path) -> None:
+    assert daemon("keys", str(tmp_path / "k"), "--broker", "base").exit_code == 0
+    key = (tmp_path / "k" / "ca.key").read_bytes()
+    (tmp_path / "k" / "ca.pem").unlink()
+    again = daemon("keys", str(tmp_path / "k"), "--program", "operator")
+    assert again.exit_code != 0
+    assert "ca.key is there without ca.pem" in again.output
+    assert (tmp_path / "k" / "ca.key").read_bytes() == key
+
+
 def test_without_cryptography_it_says_what_to_install(
     daemon: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -227,3 +227,7 @@ def test_nothing_that_a_board_says_raises(payload: bytes, subject: str) -> None:
     for request in (profile.request("mede", ()), profile.request("pare", ())):
         assert isinstance(request, Request)
         profile.read(request, frame)
+
+
+def test_a_number_beyond_all_floats_is_refused() -> None:
+    assert "got 1000" in refused("ganho", 10**400)
