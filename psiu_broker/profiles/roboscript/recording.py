@@ -6,7 +6,7 @@ A recording is a procedure: the body takes all that it hears for the script, unt
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from psiu_broker.codecs.mitya import BY_WORD, SCRIPT, Version, message, number
+from psiu_broker.codecs.mitya import BY_WORD, SCRIPT, Version, is_message, message, number
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Frame
 from psiu_broker.messages import Command, Value
@@ -69,6 +69,8 @@ def heard(frame: Frame, meaning: Callable[[int], str]) -> Reply | None:
 
     `meaning` are the errors in words. E01xx come from the phone, which does not record.
     """
+    if not is_message(frame.payload):
+        return None
     value = number(frame.payload)
     if frame.subject == RECORD and value >> 8 == 2:
         return Reply("sucesso")

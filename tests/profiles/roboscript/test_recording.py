@@ -130,6 +130,13 @@ def test_what_a_message_says_of_a_recording(version: Version, wire: bytes, statu
         assert reply.values == (wire.decode(),)
 
 
+@pytest.mark.parametrize("payload", [b"", b"E", b"E000", b"Ezzzz", b"r02000", b"\xff\xff\xff\xff\xff"])
+@pytest.mark.parametrize("subject", ["error", "script"])
+def test_what_is_no_message_says_nothing_of_a_recording(subject: str, payload: bytes) -> None:
+    from_a_broker = Frame(NOBODY, NOBODY, subject, payload, "mitya")
+    assert robot().read(robot().request("roboscript-abort", []), from_a_broker) is None
+
+
 def test_the_answer_to_a_question_of_the_greeting_is_no_objection() -> None:
     mitya = robot()
     assert [question.payload for question in mitya.greeting()] == [b"W0000"] * 2
