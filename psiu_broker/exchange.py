@@ -320,7 +320,7 @@ class Exchange:
     def release(self, robot: Address, now: float) -> None:
         """`robot` has been heard: move the frames that waited for it."""
         for held in self.holding.release(robot):
-            decision = self.router.decide(held.frame.destination, held.frame.protocol, held.arrived)
+            decision = self.router.reconsider(held.frame, held.arrived, now)
             patience_s = self._longest_wait_s(held.frame, decision.hops) - (now - held.since)
             verdict: Verdict | None
             if decision.action == "ask":

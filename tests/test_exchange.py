@@ -13,12 +13,15 @@ from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.codecs.identity import identity
 from psiu_broker.errors import LinkLost
 from psiu_broker.exchange import Exchange
-from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way
+from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Malformed, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import RawFrame
+from psiu_broker.routing.outbox import Fate
+from psiu_broker.routing.policy import Policy, Rule
+from psiu_broker.routing.quarantine import TURNS
 from psiu_broker.routing.router import SELF, Router
 from psiu_broker.routing.table import Binding, Route
-from psiu_broker.routing.verdicts import ANSWERED, Verdict
+from psiu_broker.routing.verdicts import ANSWERED, DELIVERED, Verdict
 
 BASE = Address.named("base")
 ROBOTS = tuple(Address.named(name) for name in ("PC", "MNERIM", "OUTRO", "base", "??", "ROBO UM"))
@@ -257,6 +260,72 @@ def test_a_packet_for_an_unknown_number_waits_while_the_number_is_pinged() -> No
     world.links["yard"].received(plain.encode(psiu_hexa.packet(other, own, b"")), None)
     assert world.wires("yard")[1:] == [command]
     assert world.verdicts("field") == {"delivered": 1}
+    world.balances()
+
+
+class Hill:
+    """Another broker: takes every frame."""
+
+    def __init__(self) -> None:
+        self.taken: list[Frame] = []
+
+    def ways(self) -> tuple[Way, ...]:
+        return (Way(MESH, "hill"),)
+
+    def offer(
+        self, frame: Frame, peer: object, arrived: Way, now: float, patience_s: float = 0.0, fate: Fate | None = None
+    ) -> Verdict | None:
+        self.taken.append(frame)
+        return DELIVERED
+
+
+@pytest.mark.parametrize("denied", [True, False])
+def test_a_rule_by_name_holds_for_a_number_of_which_it_is_told_only_later_whose_it_is(denied: bool) -> None:
+    world = World()
+    for name in ("field", "yard"):
+        world._add(name, MemoryAdapter(), "psiu-hexa", topology="ad-hoc")
+    world.connect("field", "yard")
+    hill = Hill()
+    world.exchange.join(hill, 2.0)
+    world.exchange.router.obey(Policy((Rule(False, destination=("ARM" if denied else "LEG",)),)))
+    bus = world.exchange.bus = Bus()
+    nine, one = Address.numbered(9), Address.numbered(1)
+    plain = codec_of(configuration(protocol="psiu-hexa"))
+    world.links["field"].received(plain.encode(psiu_hexa.packet(one, nine, b"\x04\x7f")), None)
+    assert sum(world.exchange.waiting().values()) == 1
+    world.exchange.router.announced((Address.named("ARM"), nine), Way(MESH, "hill"), "psiu-hexa", world.now)
+    assert [frame.payload for frame in hill.taken] == ([] if denied else [b"\x04\x7f"])
+    assert world.verdicts("field") == ({"denied": 1} if denied else {"delivered": 1})
+    assert [raw.verdict for raw in bus.raw if raw.link == "field"] == ["denied" if denied else "delivered"]
+    refusal = world.exchange.router.guard.last_refusal(one)
+    assert (refusal and (refusal.verdict, refusal.count)) == (("denied", 1) if denied else None)
+    world.balances()
+
+
+def test_whoever_is_held_back_moves_nobody_by_what_waited_nor_is_a_stop_kept_from_anybody(world: World) -> None:
+    order, stop = wire("PC", "LATE", "parafrente", "1"), wire("PC", "LATE", "pare")
+    for turn in range(TURNS):
+        world.now += 0.01
+        world.links["wifi"].received(wire("PC", "base", "parafrente", f"1{turn}"), PEERS[0])
+        if turn == TURNS - 2:
+            world.links["radio"].received(order, None)
+            world.links["radio"].received(stop, None)
+        else:
+            world.links["radio"].received(wire("PC", "base", "parafrente", f"2{turn}"), None)
+    assert world.verdicts("radio") == {"answered": TURNS - 2, "quarantined": 1}
+    world.balances()
+    world.links["second"].received(wire("LATE", "base", "qualseunome"), None)
+    assert world.wires("second")[1:] == [stop]
+    assert world.verdicts("radio") == {"answered": TURNS - 2, "quarantined": 2, "delivered": 1}
+    world.balances()
+
+
+def test_a_robot_that_must_be_left_alone_when_it_turns_up_is(world: World) -> None:
+    world.links["wifi"].received(wire("PC", "LATE", "parafrente", "1"), PEERS[0])
+    world.exchange.alone = {Address.named("LATE")}
+    world.links["second"].received(wire("LATE", "base", "qualseunome"), None)
+    assert wire("PC", "LATE", "parafrente", "1") not in world.wires("second")
+    assert world.verdicts("wifi") == {"refused": 1}
     world.balances()
 
 

@@ -4,7 +4,8 @@
 command that the policy denies are dropped, and so is a double; the source is learned; then the
 destination decides. A known robot has its decision ready on its route, so the
 usual frame costs three look-ups, however many robots there are; every other case is `decide`,
-which changes nothing and which `why` asks too.
+which changes nothing and which `why` asks too. What waited for an unknown robot is judged once more
+when that is heard, by `reconsider`.
 """
 
 from collections.abc import Callable, Collection, Hashable, Mapping
@@ -183,6 +184,15 @@ class Router:
         """A frame of our own leaves without being routed: what comes round of it is a double."""
         self.books.arrived(frame.source)
         self._duplicates.is_double(self._identity(frame), SELF, now, frame.subject)
+
+    def reconsider(self, frame: Frame, arrived: Way, now: float) -> Decision:
+        """Decide anew for a frame that was let in and has waited: by now it may be known whose its addresses are."""
+        if self.quarantine.held and self._is_held_back(frame, self._routes.get(frame.source), arrived, now):
+            return self._turn_away(frame, QUARANTINED, arrived, now)
+        rule = None if self.policy is None or arrived is SELF else self.policy.denial(frame, arrived)
+        if rule is not None and not self._is_played(frame, arrived):
+            return self._turn_away(frame, DENIED, arrived, now, rule)
+        return self.decide(frame.destination, frame.protocol, arrived)
 
     def decide(self, destination: Address, protocol: str, arrived: Way) -> Decision:
         """What `route` decides for a frame of `protocol` from `arrived`, doubles aside. Changes nothing."""
