@@ -103,7 +103,7 @@ class PlayedPin(BaseModel):
         number = round(value * self.scale + self.offset, self.decimals)
         low = -math.inf if self.minimum is None else self.minimum
         high = math.inf if self.maximum is None else self.maximum
-        if not low <= number <= high:
+        if not (math.isfinite(number) and low <= number <= high):
             raise ValueError(f"{self.command} takes {_span(low, high)}, got {number:g}")
         return (*self.before, int(number) if self.decimals == 0 else number)
 
@@ -121,6 +121,8 @@ class PlayedPin(BaseModel):
 
 
 def _span(low: float, high: float) -> str:
+    if (low, high) == (-math.inf, math.inf):
+        return "any number"
     if low == -math.inf:
         return f"at most {high:g}"
     if high == math.inf:

@@ -146,8 +146,9 @@ class FirmataPersona(Persona):
                 return self._set_mode(number, mode, now)
             case ServoConfig(number, shortest, longest):
                 actions = self._set_mode(number, MODES["servo"], now)
-                if not actions and shortest < longest:
-                    self._states[number].pulses = (shortest, longest)
+                state = self._states.get(number)
+                if state is not None and state.mode == MODES["servo"] and shortest < longest:
+                    state.pulses = (shortest, longest)
                 return actions
             case AnalogMessage(number, value):
                 return self._write(number, value, now)

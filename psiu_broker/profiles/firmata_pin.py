@@ -112,12 +112,12 @@ class Pin(BaseModel):
         if self.mode == "output":
             return int(number)
         scale = 100 / self._top(bits) if self._percent else 1 if self.scale is None else self.scale
-        raw = round((number - self.offset) / scale)
-        if not 0 <= raw <= self._top(bits):
+        exact = (number - self.offset) / scale
+        if not math.isfinite(exact) or not 0 <= round(exact) <= self._top(bits):
             raise ValueError(
-                f"would need {raw} on the wire, which is 0–{self._top(bits)}: mend scale, offset or limits"
+                f"would need {exact:.0f} on the wire, which is 0–{self._top(bits)}: mend scale, offset or limits"
             )
-        return raw
+        return round(exact)
 
     def takes(self, bits: int | None) -> str:
         """Its range for a person: ``0–180 deg``, ``on or off``."""

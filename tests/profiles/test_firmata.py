@@ -436,6 +436,12 @@ def test_limits_that_the_wire_cannot_carry_are_refused_with_a_remedy() -> None:
     )
 
 
+def test_so_is_a_scale_by_which_a_value_is_beyond_all_numbers() -> None:
+    robot = profile({"x": {"pin": 3, "mode": "pwm", "minimum": 0, "maximum": 1e308, "scale": 1e-300}})
+    code, text = refusal(robot, "x", 1e300)
+    assert (code, text) == ("refused", "x would need inf on the wire, which is 0–255: mend scale, offset or limits")
+
+
 @given(mode=st.sampled_from(["pwm", "servo"]), percent=st.booleans(), value=st.floats(-500, 500))
 def test_any_value_is_refused_or_confirmed(mode: str, percent: bool, value: float) -> None:
     pins = {"x": {"pin": 3, "mode": mode, **({"unit": "%"} if percent else {})}}

@@ -178,6 +178,20 @@ class TestWriting:
         assert board.hears(AnalogMessage(10, 600)) == [Call("braço", (0,), newest=True)]
         assert board.hears(AskPinState(10)) == [PinState(10, MODES["servo"], 0)]
 
+    def test_pulses_count_for_a_pin_that_was_something_else_before(self, board: Board) -> None:
+        board.hears(PinMode(10, MODES["output"]), PinValue(10, True))
+        board.hears(ServoConfig(10, 1000, 2000))
+        assert board.hears(AnalogMessage(10, 1500)) == [Call("braço", (90,), newest=True)]
+
+    def test_pulses_for_a_pin_that_is_not_there_are_refused_however_often(self, board: Board) -> None:
+        said = [board.hears(ServoConfig(100, 1000, 2000)) for _ in range(10)]
+        assert said[0] == [Text("pin 100 cannot be servo")]
+        assert said[-1] == []
+
+    def test_a_scale_beyond_all_numbers_is_refused_like_any_other_value(self) -> None:
+        board = Board({"3": {"command": "roda", "mode": "pwm", "scale": 1e308}})
+        assert board.hears(AnalogMessage(3, 255)) == [Text("roda takes any number, got inf")]
+
     def test_a_value_out_of_range_is_refused_with_the_range(self, board: Board) -> None:
         assert board.hears(AnalogMessage(9, 170)) == [Text("garra takes -45 to 45, got 80")]
 
