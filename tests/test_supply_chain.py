@@ -1,7 +1,11 @@
 """What the code never does with what it hears, and that CI installs exactly what was looked at."""
 
 import ast
+import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -77,6 +81,52 @@ def test_each_package_of_the_lock_is_known_by_its_hash() -> None:
     pins = [line for line in logical if line and not line.lstrip().startswith("#")]
     assert len(pins) > 50
     assert all("==" in line and "--hash=sha256:" in line for line in pins)
+
+
+GOOD = {"name": "click", "version": "8.3.1", "vulns": []}
+BAD = {"name": "pillow", "version": "1.0", "vulns": [{"id": "PYSEC-2026-1", "fix_versions": []}]}
+SKIPPED = {"name": "attrs", "skip_reason": "Dependency not found on PyPI and could not be audited"}
+
+
+@pytest.mark.parametrize(
+    ("answer", "ended", "code", "said"),
+    [
+        ({"dependencies": [GOOD]}, 0, 0, ["1 of 1 packages audited, 0 vulnerabilities"]),
+        (
+            {"dependencies": [GOOD, BAD]}, 1, 1,
+            ["2 of 2 packages audited, 1 vulnerabilities", "pillow 1.0: PYSEC-2026-1"],
+        ),
+        (
+            {"dependencies": [SKIPPED, BAD]}, 1, 1,
+            ["1 of 2 packages audited, 1 vulnerabilities", "pillow 1.0: PYSEC-2026-1", "NOT AUDITED: attrs"],
+        ),
+        (
+            {"dependencies": [SKIPPED]}, 0, 0,
+            ["0 of 1 packages audited, 0 vulnerabilities",
+             "NOT AUDITED: the package index tells nothing of vulnerabilities, of no package"],
+        ),
+        ({}, 1, 0, ["NOT AUDITED: no answer from the package index"]),
+        (None, 1, 0, ["NOT AUDITED: no answer from the package index"]),
+        (None, 2, 1, []),
+    ],
+)  # fmt: skip
+def test_an_audit_fails_by_vulnerabilities_and_says_aloud_what_was_not_audited(
+    tmp_path: Path, answer: object, ended: int, code: int, said: list[str]
+) -> None:
+    text = "" if answer is None else json.dumps(answer)
+    (tmp_path / "pip_audit.py").write_text(f"import sys\nprint({text!r})\nsys.exit({ended})\n")
+    audit = subprocess.run(
+        [sys.executable, ROOT / ".ci/audit.py"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert audit.returncode == code, audit
+    assert audit.stdout.split("\n")[: len(said)] == said
+    assert ("NOT AUDITED" in audit.stderr) == (ended == 2)
+
+
+def test_an_audit_without_its_program_fails() -> None:
+    audit = subprocess.run([sys.executable, "-S", ROOT / ".ci/audit.py"], capture_output=True, text=True, check=False)
+    assert (audit.returncode, audit.stderr) == (1, "NOT AUDITED: pip-audit is missing; make audit installs it\n")
 
 
 def test_every_test_that_the_threat_model_appeals_to_is_there() -> None:
