@@ -1,13 +1,16 @@
 """Robots that somebody moved, and what stops them when nobody is left who could: ``[robots.NAME.failsafe]``.
 
-A program is known by the id that its calls carry, and is there for as long as its token on the bus is. Whoever
-commands a robot by a frame of its own is no program: only a silent link and the end of the broker concern it.
+A program is known by the id that its calls carry, and is there for as long as its token on the bus is, whichever
+broker it is connected to; the broker that sends to the robot watches. Whoever commands a robot by a frame of its own is
+no program: only a silent link and the end of the broker concern it, and a program that moved the robot before is missed
+as if nobody had since.
 """
 
 import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -25,6 +28,8 @@ AGAIN_S: Final = 1.0
 """How long after a stop that did not leave it is tried again."""
 LAST_S: Final = 1.5
 """How long a stopping broker lets robots answer their stops."""
+ON_LINK: Final = "@"
+"""How the ids of programs begin that come by a link and have no token; no program on the bus is called so."""
 PROGRAMS_KEPT: Final = 16_384
 OFFERED_KEPT: Final = 256
 
@@ -44,11 +49,14 @@ class Ward:
     moved_at: float = -inf
     """When it was moved last; -inf: it has been stopped since, or nobody moved it."""
     program: str | None = None
-    """Who moved it; None: nobody who would be missed."""
+    """Who of those who would be missed moved it last; None: nobody."""
     due: str = ""
     """Why it is to be stopped; empty: it is not."""
+    failed: bool = False
+    """A stop that is due did not leave."""
     not_before: float = -inf
     stopping: asyncio.Task[None] | None = None
+    """The try that is under way, until the stop leaves."""
     asked_of: tuple[str, bytes] = ("", b"")
     """Subject and payload of what stops it."""
 
@@ -85,6 +93,8 @@ class Failsafe:
         self.links: Final = frozenset(ward.link for ward in self._all)
         self.last: Final = frozenset(each for each, ward in self._wards.items() if "broker_stop" in ward.options.on)
         """Those that are to hear nothing after the stop of a broker that stops."""
+        self._open: set[str] = set()
+        self._tries: set[asyncio.Task[None]] = set()
         self._closed = False
         self._present: set[str] = set()
         self._awaited: dict[str, float] = {}
@@ -122,7 +132,9 @@ class Failsafe:
             if self._is_stop(ward, frame):
                 if frame.destination == EVERYONE:
                     continue  # robots take no heed of it
-                ward.moved_at, ward.program, ward.due = -inf, None, ""
+                if ward.due:
+                    log.info("%s has been told to stop", ward.robot)
+                _let_go(ward)
             elif not request.question if request is not None else self._moves(ward, frame):
                 self._note(ward, program, now)
 
@@ -154,15 +166,17 @@ class Failsafe:
     def programs_unsure(self) -> None:
         """The bus may not have told of some that went: each has to show its token again."""
         until = self._clock() + AWAITED_S
-        self._awaited.update(dict.fromkeys(self._present, until))
+        self._awaited.update({program: until for program in self._present if not program.startswith(ON_LINK)})
 
     def link_opened(self, link: str) -> None:
+        self._open.add(link)
         for ward in self._all:
             if ward.link == link and ward.due:
                 ward.not_before = -inf
                 self._begin(ward)
 
     def link_closed(self, link: str) -> None:
+        self._open.discard(link)
         for ward in self._all:
             if ward.link == link and ward.moves:
                 self._set_due(ward, "link_silent", "its link went down")
@@ -182,17 +196,26 @@ class Failsafe:
                 self._begin(ward)
 
     async def close(self) -> None:
-        """The broker stops, and nothing else is sent any more: stop what moves; return when that has ended."""
+        """The broker stops, and nothing else is sent any more: stop what moves, try once more what did not leave,
+        whyever it was due, and return when that has ended."""
         for ward in self._all:
             if ward.moves:
                 self._set_due(ward, "broker_stop", "the broker stops")
+            if ward.due:
+                self._begin(ward)
+        under_way = [(ward, ward.stopping) for ward in self._all if ward.stopping is not None]
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LAST_S):
+                await asyncio.gather(*(self._try_once_more(ward, task) for ward, task in under_way))
+                if self._tries:
+                    await asyncio.wait(self._tries)
         self._closed = True
-        tasks = [ward.stopping for ward in self._all if ward.stopping is not None]
-        if tasks:
-            _, late = await asyncio.wait(tasks, timeout=LAST_S)
-            for task in late:
-                task.cancel()
-            await asyncio.gather(*late, return_exceptions=True)
+        for task in self._tries:
+            task.cancel()
+        await asyncio.gather(*self._tries, return_exceptions=True)
+        for ward in self._all:
+            if ward.due:
+                log.warning("%s may go on: the broker ends before it could be told to stop", ward.robot)
 
     # Inside.
 
@@ -217,13 +240,20 @@ class Failsafe:
         return profile is not None and profile.moves(frame)
 
     def _note(self, ward: Ward, program: str | None, now: float) -> None:
-        ward.moved_at, ward.due = now, ""
-        ward.program = None if program is None or self._gone.get(program) == _DONE else program
-        if ward.program is not None and ward.program not in self._present:
-            if ward.program in self._gone:
-                self._set_due(ward, "program_gone", "the program that moved it is gone")
-            else:
-                self._awaited.setdefault(ward.program, now + AWAITED_S)
+        """It has been moved, by `program`, or by somebody who would not be missed and takes nothing over."""
+        ward.moved_at = now
+        gone = None if program is None else self._gone.get(program)
+        if program is None or gone == _DONE:
+            return
+        ward.program = program
+        if gone == _VANISHED:
+            self._set_due(ward, "program_gone", "the program that moved it is gone")
+            return
+        if ward.due:
+            log.info("%s need not be stopped any more: another program moves it", ward.robot)
+            ward.due = ""
+        if program not in self._present:
+            self._awaited.setdefault(program, now + AWAITED_S)
 
     def _leave(self, program: str, how: str) -> None:
         self._present.discard(program)
@@ -234,26 +264,46 @@ class Failsafe:
 
     def _set_due(self, ward: Ward, loss: str, why: str) -> None:
         if loss in ward.options.on and not ward.due:
-            ward.due = why
-            ward.not_before = -inf
+            ward.due, ward.failed, ward.not_before = why, False, -inf
+            later = "" if ward.link in self._open else f", once link {ward.link} is open"
+            log.warning("%s is told to stop%s: %s", ward.robot, later, why)
             self._begin(ward)
 
     def _begin(self, ward: Ward) -> None:
-        if ward.stopping is None and not self._closed:
-            ward.stopping = asyncio.get_running_loop().create_task(self._carry_out(ward))
+        if ward.stopping is None and ward.link in self._open and not self._closed:
+            ward.not_before = self._clock() + AGAIN_S
+            task = ward.stopping = asyncio.get_running_loop().create_task(self._carry_out(ward))
+            self._tries.add(task)
+            task.add_done_callback(self._tries.discard)
 
     async def _carry_out(self, ward: Ward) -> None:
         """Have the robot stopped; if that does not leave, it stays due."""
-        log.warning("%s is told to stop: %s", ward.robot, ward.due)
         try:
             await self._stop(ward.robot, ward.options, LAST_S)
         except CallError as error:
-            if error.code == "unknown_robot":  # it is another broker's
-                ward.moved_at, ward.program, ward.due = -inf, None, ""
-            log.warning("%s was told to stop, and may go on: %s", ward.robot, error)
+            if ward.stopping is not asyncio.current_task():  # it has left
+                log.warning("%s was told to stop, and may go on: %s", ward.robot, error)
+            elif error.code == "unknown_robot":  # it is another broker's
+                log.warning("%s is not told to stop: %s", ward.robot, error)
+                _let_go(ward)
+            elif not ward.failed:
+                ward.failed = True
+                log.warning("%s could not be told to stop yet: %s", ward.robot, error)
         finally:
-            ward.stopping = None
-            ward.not_before = self._clock() + AGAIN_S
+            if ward.stopping is asyncio.current_task():
+                ward.stopping = None
+
+    async def _try_once_more(self, ward: Ward, under_way: asyncio.Task[None]) -> None:
+        await asyncio.wait([under_way])
+        if ward.due:
+            self._begin(ward)
+        if ward.stopping is not None:
+            await asyncio.wait([ward.stopping])
+
+
+def _let_go(ward: Ward) -> None:
+    """It stands, or is somebody else's to watch."""
+    ward.moved_at, ward.program, ward.due, ward.stopping = -inf, None, "", None
 
 
 _DONE: Final = "done"

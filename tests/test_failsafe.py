@@ -1,7 +1,7 @@
 """Who is missed, and what a robot is told then; no bus, no links, and the time as the test says."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
@@ -26,27 +26,42 @@ PROFILE = PsiuProfile()
 class Lab:
     """MNERIM on `radio`; each stop leaves at once, unless `fails` says why it cannot."""
 
-    def __init__(self, *on: str, command: str = "pare", silent_s: float = 5.0) -> None:
+    def __init__(
+        self, *on: str, command: str = "pare", silent_s: float = 5.0, robots: Sequence[str] = ("MNERIM",)
+    ) -> None:
         options = FailsafeConfiguration.model_validate(
             {"command": command, "on": on or ("program_gone", "broker_stop"), "silent_s": silent_s}
         )
-        robot = RobotConfiguration("MNERIM", "radio", "psiu-ascii", None, None, PsiuOptions(), failsafe=options)
-        made = Configuration(BrokerConfiguration(name="base"), ZenohConfiguration(), {}, {"MNERIM": robot})
-        self.now, self.heard_at, self.stops = 100.0, 0.0, 0
+        table = {
+            name: RobotConfiguration(name, "radio", "psiu-ascii", None, None, PsiuOptions(), failsafe=options)
+            for name in robots
+        }
+        made = Configuration(BrokerConfiguration(name="base"), ZenohConfiguration(), {}, table)
+        self.now, self.heard_at = 100.0, 0.0
+        self.stopped: list[str] = []
         self.fails: CallError | None = None
+        self.answers = True
         self.failsafe = Failsafe(made, self._stop, lambda _: PROFILE, lambda _: self.heard_at, lambda: self.now)
+        self.failsafe.link_opened("radio")
         self.command = command
 
-    def moves(self, program: str | None = None, word: str = "parafrente") -> None:
+    @property
+    def stops(self) -> int:
+        return len(self.stopped)
+
+    def moves(self, program: str | None = None, word: str = "parafrente", robot: str = "MNERIM") -> None:
         """A call of a program's, or of nobody's in particular, leaves."""
-        request = PROFILE.request(word, [] if word != "parafrente" else [10])
-        ward, frame = self.failsafe.ward(MNERIM), self.frame(request.payload.decode())
+        request, to = PROFILE.request(word, [] if word != "parafrente" else [10]), Address.named(robot)
+        ward, frame = self.failsafe.ward(to), self.frame(request.payload.decode(), to)
         assert ward is not None
         self.failsafe.offered(ward, frame, request, program)
         self.failsafe.left("radio", frame, self.now)
 
     def frame(self, text: str, to: Address = MNERIM) -> Frame:
         return psiu_ascii.message(PC, to, *text.split())
+
+    def moved_by_another_robot(self) -> None:
+        self.failsafe.left("radio", self.frame("parafrente 10"), self.now)
 
     async def after(self, seconds: float) -> int:
         """How often MNERIM was told to stop so far."""
@@ -57,10 +72,12 @@ class Lab:
         return self.stops
 
     async def _stop(self, robot: Address, options: FailsafeConfiguration, timeout_s: float) -> None:
-        self.stops += 1
+        self.stopped.append(str(robot))
         if self.fails is not None:
             raise self.fails
-        self.failsafe.left("radio", self.frame(self.command), self.now)
+        self.failsafe.left("radio", self.frame(self.command, robot), self.now)
+        if not self.answers:
+            await asyncio.sleep(timeout_s)
 
 
 async def test_the_robot_of_a_program_that_vanished_is_stopped_once() -> None:
@@ -82,6 +99,48 @@ async def test_only_who_moved_it_last_is_missed() -> None:
     assert await lab.after(1) == 0
     lab.failsafe.program_gone("q")
     assert await lab.after(0) == 1
+
+
+@pytest.mark.parametrize(("text", "to"), [("parafrente 10", MNERIM), ("parafrente 10", EVERYONE), ("xyzzy", MNERIM)])
+async def test_who_is_no_program_takes_no_robot_from_the_program_that_moved_it(text: str, to: Address) -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.left("radio", lab.frame(text, to), lab.now)
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 1
+
+
+async def test_a_call_of_nobody_in_particular_takes_no_robot_from_a_program() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.moves(None, "buzina")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 1
+
+
+async def test_what_a_program_asked_for_before_it_went_in_good_order_takes_no_robot_from_another() -> None:
+    lab = Lab()
+    for program in ("p", "q"):
+        lab.failsafe.program_came(program)
+    lab.moves("p")
+    lab.failsafe.program_done("q")
+    lab.moves("q")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(1) == 1
+
+
+async def test_all_robots_of_a_program_are_stopped_and_no_other() -> None:
+    lab = Lab(robots=("MNERIM", "LEONIDES", "CANHAO"))
+    for program in ("p", "q"):
+        lab.failsafe.program_came(program)
+    lab.moves("p")
+    lab.moves("p", robot="LEONIDES")
+    lab.moves("q", robot="CANHAO")
+    lab.failsafe.program_gone("p")
+    await lab.after(1)
+    assert lab.stopped == ["MNERIM", "LEONIDES"]
 
 
 @pytest.mark.parametrize("word", ["qualseunome", "quantoscomandos", "pare"])
@@ -182,17 +241,109 @@ async def test_a_robot_whose_link_went_down_is_stopped_when_it_is_open_again_and
     assert await lab.after(60) == before + 1
 
 
-async def test_a_stop_that_did_not_leave_is_tried_again_until_somebody_moves_the_robot() -> None:
-    lab = Lab()
+async def due_and_stuck(*on: str) -> Lab:
+    """MNERIM, which `p` moved before it vanished, and which could not be told to stop."""
+    lab = Lab(*on)
     lab.fails = CallError("expired", "the link was stuck")
     lab.failsafe.program_came("p")
     lab.moves("p")
     lab.failsafe.program_gone("p")
     assert await lab.after(0) == 1
+    return lab
+
+
+async def test_a_stop_that_did_not_leave_is_tried_again_until_another_program_moves_the_robot() -> None:
+    lab = await due_and_stuck()
     assert await lab.after(AGAIN_S / 2) == 1
     assert await lab.after(AGAIN_S) == 2
-    lab.moves()
+    lab.failsafe.program_came("q")
+    lab.moves("q")
     assert await lab.after(10 * AGAIN_S) == 2
+    lab.fails = None
+    lab.failsafe.program_gone("q")
+    assert await lab.after(0) == 3
+
+
+async def test_who_moves_a_robot_meanwhile_and_would_not_be_missed_spares_it_no_stop() -> None:
+    lab = await due_and_stuck()
+    lab.moves()
+    lab.moved_by_another_robot()
+    lab.failsafe.program_done("q")
+    lab.moves("q")
+    lab.fails = None
+    assert await lab.after(AGAIN_S) == 2
+    assert await lab.after(10 * AGAIN_S) == 2
+
+
+@pytest.mark.parametrize("on", [(), ("program_gone",)], ids=["on broker_stop too", "on program_gone alone"])
+async def test_a_stop_that_did_not_leave_is_tried_again_at_once_when_the_broker_stops(on: tuple[str, ...]) -> None:
+    lab = await due_and_stuck(*on)
+    lab.fails = None
+    await lab.failsafe.close()
+    assert lab.stops == 2
+
+
+async def test_a_stop_that_fails_while_the_broker_stops_is_tried_once_more() -> None:
+    lab = Lab()
+    lab.moves()
+    lab.fails = CallError("busy", "no room")
+    await lab.failsafe.close()
+    assert lab.stops == 2
+
+
+async def test_a_robot_is_missed_anew_though_the_answer_to_its_last_stop_is_still_awaited() -> None:
+    lab = Lab()
+    lab.answers = False
+    for times in (1, 2):
+        lab.failsafe.program_came("p")
+        lab.moves("p")
+        lab.failsafe.program_gone("p")
+        assert await lab.after(0) == times
+    await lab.failsafe.close()
+
+
+async def test_while_a_link_is_down_its_robots_are_told_nothing_and_one_line_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = Lab("link_silent", "program_gone", silent_s=2.0)
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.link_closed("radio")
+    lab.failsafe.program_gone("p")
+    for _ in range(600):
+        assert await lab.after(1) == 0
+    assert [record.message for record in caplog.records] == [
+        "MNERIM is told to stop, once link radio is open: its link went down"
+    ]
+    await lab.failsafe.close()
+    assert lab.stops == 0
+
+
+async def test_a_stop_that_fails_again_and_again_is_told_once_and_so_is_its_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    lab = await due_and_stuck()
+    for _ in range(600):
+        await lab.after(AGAIN_S)
+    lab.fails = None
+    await lab.after(AGAIN_S)
+    assert [record.message for record in caplog.records] == [
+        "MNERIM is told to stop: the program that moved it is gone",
+        "MNERIM could not be told to stop yet: the link was stuck",
+        "MNERIM has been told to stop",
+    ]
+
+
+async def test_a_program_on_a_link_has_no_token_to_show_after_a_trouble_of_the_bus() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("@panel")
+    lab.moves("@panel")
+    lab.failsafe.programs_unsure()
+    assert await lab.after(10 * AWAITED_S) == 0
+    lab.moves("@panel")
+    lab.failsafe.program_gone("@panel")
+    assert await lab.after(0) == 1
 
 
 async def test_the_robot_of_another_broker_is_left_to_it() -> None:
