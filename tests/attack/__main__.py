@@ -27,12 +27,27 @@ _DONE: Final = re.compile(r"Done (\d+) runs in (\d+) second")
 _COVERED: Final = re.compile(r"cov: (\d+)")
 
 
+class _Hex(click.ParamType):
+    name = "HEX"
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        try:
+            return bytes.fromhex(value)
+        except ValueError:
+            self.fail(f"{value} is no hexadecimal", param, ctx)
+
+
 @click.command()
 @click.option("--seconds", type=click.IntRange(1), default=60, help="For all targets together; 60 by default.")
 @click.option("--keep", "keeping", is_flag=True, help="Keep the inputs that reached something new in the corpus.")
+@click.option("--input", "told", type=_Hex(), help="Tell the targets this one input instead; needs no atheris.")
 @click.argument("targets", nargs=-1, type=click.Choice(list(TARGETS)))
-def main(seconds: int, keeping: bool, targets: Sequence[str]) -> None:
+def main(seconds: int, keeping: bool, told: bytes | None, targets: Sequence[str]) -> None:
     """Attack TARGETS, or all; 1 if an input did what it must not."""
+    if told is not None:
+        for name in targets or TARGETS:
+            TARGETS[name](told)
+        return
     if importlib.util.find_spec("atheris") is None:
         raise click.ClickException("atheris is not installed; it is in the extra fuzz, for Python 3.11 to 3.13")
     names = targets or list(TARGETS)
@@ -57,7 +72,9 @@ def _attack(name: str, seconds: int, *, keeping: bool) -> bool:
         if run.returncode or done is None:
             print(run.stdout, run.stderr, sep="\n")
             for artifact in artifacts.iterdir():
-                print(f"{name}: {artifact.name.partition('-')[0]} by {artifact.read_bytes().hex()}")
+                data = artifact.read_bytes().hex()
+                print(f"{name}: {artifact.name.partition('-')[0]} by this input; tell it again with")
+                print(f"  python -m tests.attack --input '{data}' {name}", flush=True)
             return False
         new = len(list(found.iterdir()))
         print(

@@ -4,10 +4,12 @@ The first byte of an input chooses among the configurations of its target, the s
 """
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Final
+
+from attack.robots import CALLS, MAPS, ROBOTS
 
 from psiu_broker.bus.calls import read_request
 from psiu_broker.bus.keys import Keys
@@ -16,8 +18,10 @@ from psiu_broker.codecs.identity import identity
 from psiu_broker.errors import CallError, EncodeError, LinkError
 from psiu_broker.frame import NOBODY, Address, Frame, Malformed
 from psiu_broker.mesh.envelope import Envelope, pack, unpack
-from psiu_broker.messages import Decoded
+from psiu_broker.messages import Answer, Decoded
 from psiu_broker.profiles.describe import describe
+from psiu_broker.profiles.persona import Call, Persona, Say
+from psiu_broker.profiles.profile import Description, Profile, Request
 from psiu_broker.profiles.responder import Responder
 from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.trunk.wire import Reader
@@ -98,16 +102,17 @@ def hear(protocol: str, data: bytes) -> None:
 
 
 def _use(protocol: str, options: dict[str, Any], codec: Codec, frames: Sequence[Frame]) -> None:
-    entry = PROTOCOLS[protocol]
-    settings = entry.codec.Options.model_validate(options)
-    profile = entry.profile.make(settings, entry.profile.Options(), 1.0)
+    profile = robot_of(protocol, options)
+    asked = list(_requests(protocol, profile))
     responder = Responder("PC")
-    personas = []
-    if entry.persona is not None:
-        personas.append(entry.persona("MNERIM", settings, entry.persona.Options()))
+    persona = persona_of(protocol, options)
     for frame in frames:
         identity(frame)
-        profile.learn(frame)
+        while profile.learn(frame) and profile.greeting():
+            pass
+        profile.moves(frame)
+        for request in asked:
+            profile.read(request, frame)
         for description in (profile.describe(frame), describe(frame, lambda _: {})):
             decoded = Decoded(
                 source=str(frame.source), destination=str(frame.destination), protocol=protocol, broker="b", link="l",
@@ -117,13 +122,48 @@ def _use(protocol: str, options: dict[str, Any], codec: Codec, frames: Sequence[
         KEYS.decoded(frame.source, frame.destination, frame.subject)
         if protocol in ("psiu-ascii", "psiu-hexa"):
             responder.answer(frame, 0.0)
-        for persona in personas:
-            persona.heard(frame, 0.0)
-        _write(codec, frame)
+        if persona is not None:
+            _play(persona, codec, frame, profile.describe(frame))
+        _write(options, codec, frame)
         _hand_on(frame)
 
 
-def _write(codec: Codec, frame: Frame) -> None:
+def robot_of(protocol: str, options: dict[str, Any]) -> Profile:
+    entry = PROTOCOLS[protocol]
+    robot = entry.profile.Options.model_validate(ROBOTS[protocol])
+    return entry.profile.make(entry.codec.Options.model_validate(options), robot, 1.0)
+
+
+def _requests(protocol: str, profile: Profile) -> Iterator[Request]:
+    for command, parameters in CALLS[protocol]:
+        with contextlib.suppress(CallError):
+            yield profile.request(command, parameters)
+
+
+def persona_of(protocol: str, options: dict[str, Any]) -> Persona | None:
+    entry = PROTOCOLS[protocol]
+    if entry.persona is None:
+        return None
+    settings = entry.codec.Options.model_validate(options)
+    return entry.persona("MNERIM", settings, entry.persona.Options.model_validate(MAPS[protocol]))
+
+
+def _play(persona: Persona, codec: Codec, frame: Frame, told: Description) -> None:
+    """The program says `frame`; what it calls is done, then not; and the robot tells what `told` says."""
+    actions = list(persona.heard(frame, 0.0))
+    for call in [action for action in actions if isinstance(action, Call)]:
+        actions += persona.answered(call, Answer(values=[1, "x"], elapsed_ms=1), "", 0.0)
+        actions += persona.answered(call, None, "nothing came", 0.0)
+    actions += persona.told(told, 0.0)
+    if (until := persona.waits_until()) is not None:
+        actions += persona.due(until)
+    for action in actions:
+        if isinstance(action, Say):
+            with contextlib.suppress(EncodeError):
+                codec.encode(Frame(NOBODY, NOBODY, action.subject, action.payload, codec.protocol))
+
+
+def _write(options: dict[str, Any], codec: Codec, frame: Frame) -> None:
     """Writing `frame` anew gives bytes that are read as the same frame, or is refused."""
     with contextlib.suppress(EncodeError):
         codec.encode(frame)
@@ -131,8 +171,9 @@ def _write(codec: Codec, frame: Frame) -> None:
         wire = codec.encode(frame._replace(wire=b"", dialect=""))
         if codec.protocol in ("psiu-ascii", "psiu-hexa"):
             heard = [event for event in read(codec, [wire]) if isinstance(event, Frame)]
-            same = [(each.destination, each.payload) for each in heard]
-            assert same == [(frame.destination, frame.payload)], "it is written as something else"
+            assert [each.payload for each in heard] == [frame.payload], "it is written as something else"
+            if options.get("topology", "ad-hoc") == "ad-hoc":  # in others, what is written is heard at the far end
+                assert [each.destination for each in heard] == [frame.destination], "it is written for somebody else"
 
 
 def _hand_on(frame: Frame) -> None:
@@ -145,17 +186,23 @@ def _hand_on(frame: Frame) -> None:
 
 
 def from_a_broker(data: bytes) -> None:
-    """Another broker hands on `data` as a frame: it is none, or can be described, handed on and written or refused."""
+    """Another broker hands on `data` as a frame: it is none, or can be described, handed on and written or refused.
+
+    Robots of every protocol may be awaiting an answer just then.
+    """
     envelope = unpack(data)
     if envelope is None:
         return
     frame = envelope.frame
     with contextlib.suppress(EncodeError):
         assert unpack(pack(envelope)) == envelope
-    identity(frame)
-    options = OPTIONS[frame.protocol][0]
+    options = OPTIONS[frame.protocol][envelope.epoch % len(OPTIONS[frame.protocol])]
     codec = codec_of(frame.protocol, options)
     _use(frame.protocol, options, codec, [frame])
+    for protocol in PROTOCOLS:
+        robot = robot_of(protocol, OPTIONS[protocol][0])
+        for request in _requests(protocol, robot):
+            robot.read(request, frame)
 
 
 def over_a_trunk(data: bytes) -> None:
@@ -175,11 +222,9 @@ def from_a_program(data: bytes) -> None:
     """A program calls a command, both as it likes: it is refused with a `CallError`, or becomes a frame or none."""
     choice, (command, _, payload) = data[:1] or b"\0", data[1:].partition(b"\n")
     protocol = sorted(PROTOCOLS)[choice[0] % len(PROTOCOLS)]
-    entry = PROTOCOLS[protocol]
     options = OPTIONS[protocol][0]
+    profile = robot_of(protocol, options)
     try:
-        settings = entry.codec.Options.model_validate(options)
-        profile = entry.profile.make(settings, entry.profile.Options(), 1.0)
         asked = profile.request(command.decode("utf-8", "replace"), read_request(payload).parameters)
     except CallError:
         return

@@ -1,12 +1,15 @@
 """What `make fuzz` found worth keeping, told again to everything that hears strangers."""
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from attack import __main__ as runner
 from attack.corpus import kept
 from attack.targets import TARGETS
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,6 +42,35 @@ def test_nor_does_what_is_like_it(target: str) -> None:
         TARGETS[target](bytes(data))
 
     told()
+
+
+def test_what_broke_a_target_is_printed_whole_with_what_tells_it_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broke = bytes(range(256)) * 8
+
+    def fuzz(name: str, *arguments: Path | str) -> subprocess.CompletedProcess[str]:
+        prefix = next(each for each in map(str, arguments) if each.startswith("-artifact_prefix="))
+        Path(prefix.partition("=")[2], "crash-0123").write_bytes(broke)
+        return subprocess.CompletedProcess([], 77, "", "ValueError: no message\n")
+
+    monkeypatch.setattr(runner, "_fuzz", fuzz)
+    assert not runner._attack("trunk", 1, keeping=False)
+    printed = capsys.readouterr().out
+    assert "ValueError: no message" in printed
+    command = next(shlex.split(line) for line in printed.splitlines() if "python -m tests.attack" in line)
+    assert bytes.fromhex(command[command.index("--input") + 1]) == broke
+    again = subprocess.run([sys.executable, *command[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stdout + again.stderr
+
+
+def test_an_input_told_again_fails_as_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[bytes] = []
+    monkeypatch.setattr(runner, "TARGETS", {"trunk": heard.append})
+    assert CliRunner().invoke(runner.main, ["--input", "00ff", "trunk"]).exit_code == 0
+    assert heard == [b"\x00\xff"]
+    monkeypatch.setattr(runner, "TARGETS", {"trunk": lambda _: 1 / 0})
+    assert isinstance(CliRunner().invoke(runner.main, ["--input", "00", "trunk"]).exception, ZeroDivisionError)
 
 
 def test_the_fuzzer_attacks_a_target_for_as_long_as_it_is_told() -> None:
