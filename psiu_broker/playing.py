@@ -16,7 +16,7 @@ from psiu_broker.config import Configuration
 from psiu_broker.config.who import Ends, ends
 from psiu_broker.errors import CallError
 from psiu_broker.exchange import Exchange
-from psiu_broker.failsafe import Failsafe
+from psiu_broker.failsafe import ON_LINK, Failsafe
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.link import Link
 from psiu_broker.messages import Answer, CallRequest
@@ -146,8 +146,7 @@ class Playing:
 
 
 def _id(way: Way) -> str:
-    """No program on the bus may be called so."""
-    return f"@{way}"
+    return f"{ON_LINK}{way}"
 
 
 class _Asked(NamedTuple):

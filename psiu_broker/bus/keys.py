@@ -103,11 +103,17 @@ class Keys:
         return self._join("@program", chunk(program))
 
     def read_program(self, key: str) -> tuple[str, bool]:
-        """The program, and whether it says that it goes in good order; raises ValueError for any other key."""
+        """The program, and whether it says that it goes in good order; raises ValueError for any other key.
+
+        Those whose ids begin with ``@`` have no token: they are on links.
+        """
         chunks = self._split(key)
         if len(chunks) not in (2, 3) or chunks[0] != "@program" or chunks[2:] not in ([], ["done"]):
             raise ValueError(f"{key} is not the token of a program")
-        return text(chunks[1]), len(chunks) == 3
+        program = text(chunks[1])
+        if program.startswith("@"):
+            raise ValueError(f"{key} is not the token of a program")
+        return program, len(chunks) == 3
 
     def raw(self, broker: str, link: str) -> str:
         return self._join("@raw", chunk(broker), chunk(link))

@@ -34,6 +34,14 @@ def test_a_token_names_a_program_and_says_whether_it_goes_in_good_order() -> Non
     keys = Keys()
     assert keys.read_program(keys.program("painel")) == ("painel", False)
     assert keys.read_program("psiu/@program/painel/done") == ("painel", True)
-    for other in ("psiu/@program", "psiu/@program/a/b", "psiu/@program/a/done/c", "psiu/a", "other/@program/a"):
+    for other in (
+        "psiu/@program",
+        "psiu/@program/a/b",
+        "psiu/@program/a/done/c",
+        "psiu/a",
+        "other/@program/a",
+        "psiu/@program/@radio",
+        "psiu/@program/%40radio/done",
+    ):
         with pytest.raises(ValueError, match=r"is not"):
             keys.read_program(other)
