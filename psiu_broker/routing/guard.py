@@ -1,4 +1,7 @@
-"""How many new names, and frames to everyone, each link may bring; and the last that was turned away from whom."""
+"""How many new names, and frames to everyone, each link may bring; and the last that was turned away from whom.
+
+Stops to everyone have turns of their own, more of them, and no far end has those of another.
+"""
 
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -6,14 +9,21 @@ from typing import Final
 
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.routing.limits import Bucket
+from psiu_broker.routing.outbox import STOP_WORDS
 from psiu_broker.routing.policy import Rule
 from psiu_broker.routing.verdicts import Verdict
 
 TO_EVERYONE_EVERY_S: Final = 0.2
 TO_EVERYONE_AT_ONCE: Final = 20
 """As when many robots are switched on together, and each asks who is there."""
+STOP_EVERYONE_EVERY_S: Final = 0.05
+STOP_EVERYONE_AT_ONCE: Final = 50
+STOPPING_KEPT: Final = 1024
 REFUSALS_KEPT: Final = 256
 MINUTE_S: Final = 60.0
+
+_PLAIN_STOPS: Final = frozenset(word.encode() for word in STOP_WORDS)
+_OTHER_STOPS: Final = b""
 
 
 @dataclass(slots=True)
@@ -36,6 +46,7 @@ class Guard:
         self._limits: dict[str, int] = {}
         self._names: dict[str, Bucket] = {}
         self._storms: dict[str, Bucket] = {}
+        self._stopping: dict[tuple[Way, bytes], Bucket] = {}
         self._refusals: dict[Hashable, Refusal] = {}
 
     def limit(self, link: str, new_names_per_minute: int) -> None:
@@ -54,6 +65,21 @@ class Guard:
         bucket = self._storms.get(link)
         if bucket is None:
             bucket = self._storms[link] = Bucket(1 / TO_EVERYONE_EVERY_S, TO_EVERYONE_AT_ONCE)
+        return _take(bucket, now)
+
+    def may_stop_everyone(self, stop: bytes, way: Way, now: float) -> bool:
+        """Whether one more frame to everyone with the payload `stop` may come by `way` now.
+
+        A stop word alone may not only where its equal by the same way, which goes to the same robots, was let through
+        less than `STOP_EVERYONE_EVERY_S` ago. Those that say more, or say it in capitals, share the turns of one word:
+        anybody can make up any number of them.
+        """
+        key = way, stop if stop in _PLAIN_STOPS else _OTHER_STOPS
+        bucket = self._stopping.get(key)
+        if bucket is None:
+            if len(self._stopping) >= STOPPING_KEPT:
+                del self._stopping[next(iter(self._stopping))]
+            bucket = self._stopping[key] = Bucket(1 / STOP_EVERYONE_EVERY_S, STOP_EVERYONE_AT_ONCE)
         return _take(bucket, now)
 
     def refused(self, frame: Frame, verdict: Verdict, way: Way, now: float, rule: Rule | None = None) -> None:

@@ -16,7 +16,7 @@ from psiu_broker.frame import EVERYONE, MESH, NOBODY, Address, Frame, Way
 from psiu_broker.routing.books import Books
 from psiu_broker.routing.duplicates import Duplicates
 from psiu_broker.routing.guard import Guard
-from psiu_broker.routing.outbox import STOP_LANE, is_stop, lane
+from psiu_broker.routing.outbox import STOP_LANE, lane
 from psiu_broker.routing.ownership import Ownership
 from psiu_broker.routing.policy import Policy, Rule
 from psiu_broker.routing.quarantine import Quarantine
@@ -346,13 +346,18 @@ class Router:
         return target is not None and target.protocol != frame.protocol
 
     def _is_storm(self, frame: Frame, arrived: Way, now: float) -> bool:
-        """Whether `frame` is one too many to everyone; a stop never is."""
-        if frame.destination != EVERYONE or arrived is SELF or arrived.link == MESH or is_stop(frame.subject):
+        """Whether `frame` is one too many to everyone; of stops only one that comes close behind its equal is."""
+        if frame.destination != EVERYONE or arrived is SELF or arrived.link == MESH:
             return False
+        if lane(frame) == STOP_LANE:
+            return not self.guard.may_stop_everyone(frame.payload, arrived, now)
         return not self.guard.may_tell_everyone(arrived.link, now)
 
     def _learn(self, frame: Frame, source: Route | None, arrived: Way, now: float) -> Verdict | None:
-        """Take note of the sender; the verdict if it cannot be who it says, or is one too many."""
+        """Take note of the sender; the verdict if it cannot be who it says, or is one too many.
+
+        The stop of one that is turned away passes, and teaches nothing.
+        """
         if arrived == SELF or frame.source == NOBODY:
             return None
         if frame.source == EVERYONE:
@@ -363,11 +368,14 @@ class Router:
             return None
         if self.quarantine.holds(frame.source if source is None else source.robot, arrived.link):
             return None  # a stop, which teaches nothing
+        wrong: Verdict | None = None
         if source is None:
             if not self._may_come(frame.source, arrived, now):
-                return TOO_MANY_NAMES
+                wrong = TOO_MANY_NAMES
         elif self._is_newcomer(source, arrived, now):
-            return QUARANTINED
+            wrong = QUARANTINED
+        if wrong is not None:
+            return None if lane(frame) == STOP_LANE else wrong
         news = source is None or source.way != arrived or source.heard_at is None
         route = self.table.learn(frame.source, arrived, frame.protocol, now)
         if route is not None:

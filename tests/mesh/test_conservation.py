@@ -102,9 +102,15 @@ class NothingIsLostUnseen(RuleBasedStateMachine):
         for name in BROKERS:
             self.a_robot_speaks(name, RADIO, source, destination, words)
 
-    @rule(name=brokers, link=links, serial=st.integers(0, 20))
-    def a_stranger_speaks(self, name: str, link: str, serial: int) -> None:
-        self.a_robot_speaks(name, link, f"S{serial}", "MNERIM", ("parafrente", "1"))
+    @rule(
+        name=brokers,
+        link=links,
+        serial=st.integers(0, 20),
+        destination=st.sampled_from(("MNERIM", "??", "GHOST")),
+        words=st.sampled_from((("parafrente", "1"), ("pare",))),
+    )
+    def a_stranger_speaks(self, name: str, link: str, serial: int, destination: str, words: tuple[str, ...]) -> None:
+        self.a_robot_speaks(name, link, f"S{serial}", destination, words)
 
     @rule(name=brokers, destination=robots, words=words, patience=st.floats(0, 1))
     def a_broker_speaks(self, name: str, destination: str, words: tuple[str, ...], patience: float) -> None:

@@ -1,10 +1,23 @@
 """What is not listened to: sources that are elsewhere, denied commands, one name too many, storms; and what stays."""
 
+from itertools import accumulate
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from psiu_broker.frame import EVERYONE, MESH, Address, Frame, Way
-from psiu_broker.routing.guard import REFUSALS_KEPT, TO_EVERYONE_AT_ONCE, TO_EVERYONE_EVERY_S, Guard
+from psiu_broker.routing.guard import (
+    REFUSALS_KEPT,
+    STOP_EVERYONE_AT_ONCE,
+    STOP_EVERYONE_EVERY_S,
+    STOPPING_KEPT,
+    TO_EVERYONE_AT_ONCE,
+    TO_EVERYONE_EVERY_S,
+    Guard,
+)
 from psiu_broker.routing.policy import Policy, Rule
+from psiu_broker.routing.quarantine import TURNS
 from psiu_broker.routing.router import ANY, SELF, Port, Router
 from psiu_broker.routing.table import Binding
 
@@ -13,9 +26,9 @@ RADIO, CABLE = Way("radio"), Way("cable")
 HERS, HIS = Way("wifi", ("192.168.1.20", 9001)), Way("wifi", ("192.168.1.66", 9001))
 
 
-def text(source: Address, destination: Address, word: str = "parafrente", serial: int = 0) -> Frame:
-    wire = f"{destination} {word} {source} {serial}".encode()
-    return Frame(source, destination, word, word.encode(), "psiu-ascii", wire, "psiu-ascii/1")
+def text(source: Address, destination: Address, said: str = "parafrente", serial: int = 0) -> Frame:
+    wire = f"{destination} {said} {source} {serial}".encode()
+    return Frame(source, destination, said.partition(" ")[0], said.encode(), "psiu-ascii", wire, "psiu-ascii/1")
 
 
 def made(per_minute: int | None = None) -> Router:
@@ -175,6 +188,38 @@ def test_robots_that_come_back_with_their_link_are_not_new() -> None:
     assert names(router, CABLE, 6, 1, 2.0) == ["too_many_names"], "and nothing new is free by that"
 
 
+@pytest.mark.parametrize(("destination", "action"), [(BETA, "forward"), (EVERYONE, "flood"), (BASE, "answer")])
+def test_the_stop_of_one_name_too_many_passes_and_teaches_nothing(destination: Address, action: str) -> None:
+    router = made(per_minute=6)
+    names(router, CABLE, 0, 7, 0.0)
+    remote = Address.named("REMOTE")
+    assert router.route(text(remote, destination, "anda"), CABLE, 1.0).verdict == "too_many_names"
+    assert router.route(text(remote, destination, "pare sucesso"), CABLE, 1.0).verdict == "too_many_names"
+    assert router.route(text(remote, destination, "pare"), CABLE, 1.0).action == action
+    assert router.find(remote) is None
+    assert names(router, CABLE, 7, 1, 1.0) == ["too_many_names"]
+
+
+def test_stops_use_up_no_turns_of_new_names() -> None:
+    router = made(per_minute=6)
+    names(router, CABLE, 0, 6, 0.0)
+    for number in range(100):
+        router.route(text(Address.named(f"S{number}"), BETA, "pare", number), CABLE, 1.0)
+    assert names(router, CABLE, 6, 1, 10.0) == [None], "what ten seconds bring is there for a newcomer"
+
+
+def test_a_stop_passes_even_where_it_shows_that_a_name_is_taken(router: Router) -> None:
+    for turn in range(TURNS - 1):
+        assert router.route(text(PC, BASE, serial=turn), CABLE, 4.0 * turn).verdict is None
+        assert router.route(text(PC, BASE, serial=-turn - 1), RADIO, 4.0 * turn + 2).verdict is None
+    router.route(text(PC, BASE, serial=90), CABLE, 50.0)
+    assert router.route(text(PC, BETA, "pare"), RADIO, 52.0).action == "forward"
+    assert router.quarantine.holds(PC, "radio")
+    route = router.find(PC)
+    assert route is not None
+    assert route.way == CABLE
+
+
 # Storms.
 
 
@@ -192,10 +237,72 @@ def test_frames_to_everyone_are_damped_to_a_steady_rate_on_the_link_they_come_fr
     assert sum(passed[500:]) == pytest.approx(5.0 / TO_EVERYONE_EVERY_S, abs=1)
 
 
-def test_a_stop_for_everyone_is_never_one_too_many(router: Router) -> None:
+def test_other_frames_to_everyone_leave_a_stop_for_everyone_its_turn(router: Router) -> None:
     for number in range(3 * TO_EVERYONE_AT_ONCE):
         router.route(question(number), CABLE, 10.0)
     assert router.route(question(1, "pare"), CABLE, 10.0).action == "flood"
+
+
+def passes(router: Router, said: str, way: Way, now: float, serial: int) -> bool:
+    """Whether a stop to everyone, which nobody else has said in just these bytes, is let through."""
+    decision = router.route(text(PC, EVERYONE, said, serial), way, now)
+    assert decision.action == "flood" or (decision.verdict, decision.void) == ("storm", True)
+    return decision.action == "flood"
+
+
+@pytest.mark.parametrize("said", ["pare", "stop", "pare {}", "PARE", "parar agora"])
+def test_stops_for_everyone_are_damped_to_a_steady_rate(router: Router, said: str) -> None:
+    at_once = [passes(router, said.format(each), CABLE, 10.0, each) for each in range(3 * STOP_EVERYONE_AT_ONCE)]
+    assert sum(at_once) == STOP_EVERYONE_AT_ONCE
+    assert all(at_once[:STOP_EVERYONE_AT_ONCE])
+    a_thousand_a_second = [
+        passes(router, said.format(each), CABLE, 20.0 + each / 1000, 1000 + each) for each in range(5000)
+    ]
+    assert sum(a_thousand_a_second[2500:]) == pytest.approx(2.5 / STOP_EVERYONE_EVERY_S, abs=1)
+
+
+def test_the_answer_to_a_stop_is_damped_as_any_frame_to_everyone_is(router: Router) -> None:
+    passed = [
+        router.route(text(PC, EVERYONE, f"pare sucesso {number}", number), CABLE, 10.0).action == "flood"
+        for number in range(3 * TO_EVERYONE_AT_ONCE)
+    ]
+    assert sum(passed) == TO_EVERYONE_AT_ONCE
+
+
+stops_to_everyone = st.lists(
+    st.tuples(
+        st.sampled_from(["pare", "pare", "pare", "para", "stop", "pare 1", "pare 2", "PARE"]),
+        st.sampled_from([CABLE, CABLE, RADIO, HIS, HERS]),
+        st.sampled_from([0.0, 0.0, 0.0, 0.001, 0.02, 0.6]),
+        st.integers(1, 2 * STOP_EVERYONE_AT_ONCE),
+    ),
+    max_size=20,
+)
+
+
+@given(stops_to_everyone)
+def test_a_stop_is_damped_only_right_behind_its_equal_that_the_same_robots_heard(
+    steps: list[tuple[str, Way, float, int]],
+) -> None:
+    router = made()
+    heard: dict[tuple[str, Way], float] = {}
+    moments = accumulate((pause for _, _, pause, _ in steps), initial=100.0)
+    for (said, way, _, times), now in zip(steps, moments, strict=False):
+        for serial in range(times):
+            decision = router.route(text(PC, EVERYONE, said, serial), way, now)
+            if decision.verdict == "duplicate":
+                continue
+            if decision.action == "flood":
+                heard[said, way] = now
+            elif said in ("pare", "para", "stop"):
+                assert now - heard[said, way] < STOP_EVERYONE_EVERY_S
+
+
+def test_what_is_remembered_of_those_who_stop_everyone_has_an_end() -> None:
+    guard = Guard()
+    for port in range(2 * STOPPING_KEPT):
+        assert guard.may_stop_everyone(b"pare", Way("wifi", port), 0.0)
+    assert len(guard._stopping) == STOPPING_KEPT
 
 
 def test_a_storm_keeps_no_frame_for_one_robot_back(router: Router) -> None:
