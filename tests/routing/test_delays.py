@@ -1,3 +1,5 @@
+import tracemalloc
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,6 +18,18 @@ def test_what_left_at_once_counts_as_no_delay() -> None:
     delays = Delays()
     delays.note(1, 0.002)
     assert delays.ms(1) == (2.0, 2.0)
+
+
+def test_it_takes_no_more_memory_however_many_frames_waited() -> None:
+    delays = Delays()
+    tracemalloc.start()
+    try:
+        for number in range(1, 2 * FRAMES_KEPT):
+            delays.note(number, number / 1000)
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < FRAMES_KEPT, "less than a byte a frame"
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(1, 100)), min_size=1, max_size=50), st.integers(0, FRAMES_KEPT + 20))
