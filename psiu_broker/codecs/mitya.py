@@ -61,7 +61,10 @@ SCRIPT: Final = "script/"
 LETTER: Final = "letter/"
 """Before a letter that the version has no word for: ``letter/Q``."""
 STOP: Final = "stop"
-"""The subject of a frame of ours that stops both motors: a ``drive`` of 0 that overtakes what waits."""
+"""The subject of a frame of ours that stops both motors: a ``drive`` of 0 that overtakes what waits.
+
+It may have more messages around the ``drive``: those that end a script which is being played (`profiles.roboscript`).
+"""
 REALIGN: Final = "realign"
 """The subject of a frame of ours whose payload is sent as it is, to find the step of a 2012 body."""
 
@@ -71,6 +74,7 @@ BURST_S: Final = 1.0
 
 _MESSAGE: Final = re.compile(rb"[A-Za-z#*~=][0-9A-Fa-f]{4}")
 _DIGITS: Final = frozenset(b"0123456789ABCDEFabcdef")
+_STOPPING: Final = re.compile(rb"((?:[DG]0001)?([DG])0000)r010[0-9](?:Z0001)?Z0000Z0000\1")
 _REALIGNING: Final = re.compile(rb"0?W0000")
 """The question of a realignment, and the filler that may go before it."""
 _LINE_END: Final = frozenset(b"\r\n")
@@ -181,6 +185,9 @@ class Mitya(Codec):
         if frame.protocol != PROTOCOL:
             raise EncodeError(f"a frame of {frame.protocol or 'no protocol'} cannot be sent as {PROTOCOL}")
         if frame.subject == REALIGN and _REALIGNING.fullmatch(frame.payload):
+            return frame.payload
+        stopping = _STOPPING.fullmatch(frame.payload) if frame.subject == STOP else None
+        if stopping is not None and stopping[2].decode("ascii") == BY_WORD[self.version]["drive"]:
             return frame.payload
         if not is_message(frame.payload):
             raise EncodeError(f"{frame.payload!r} is not a letter and four hexadecimal digits")

@@ -385,14 +385,15 @@ class MityaProfile(Profile):
         return told
 
     def _last_of_burst(self, request: Request, frame: Frame) -> Reply | None:
-        """The robot answers each message, those of a burst too: what the last of these answers say together."""
-        if not self._answers or request.subject not in ONE_SHOTS:
+        """The robot answers each message, those of a burst or a stop too: what all these answers say together."""
+        awaited = self._burst if request.subject in ONE_SHOTS else _answered(request.payload)
+        if not self._answers or awaited == 1:
             return self._outcome(request, [frame])
         if request is not self._burst_of:
             self._burst_of, self._burst_heard = request, []
         if not any(frame is heard for heard in self._burst_heard):
             self._burst_heard.append(frame)
-        return self._outcome(request, self._burst_heard) if len(self._burst_heard) == self._burst else None
+        return self._outcome(request, self._burst_heard) if len(self._burst_heard) == awaited else None
 
     def _outcome(self, request: Request, heard: Sequence[Frame]) -> Reply:
         error = next((frame for frame in heard if frame.subject == "error"), None)
@@ -494,6 +495,11 @@ def _number(value: Value, names: Mapping[str, int]) -> int | float | None:
     if isinstance(value, int):
         return value  # however great
     return None if isinstance(value, str) or not math.isfinite(value) else value
+
+
+def _answered(payload: bytes) -> int:
+    """How many of the messages are answered with ``#0000`` outside a recording: all but those that end one."""
+    return sum(payload[at : at + 1] != b"Z" for at in range(0, len(payload), mitya.MESSAGE_BYTES))
 
 
 def _volts(payload: bytes) -> tuple[int, float]:

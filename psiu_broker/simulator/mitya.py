@@ -105,6 +105,10 @@ class MityaBody(Robot):
         """The slot that is recorded now."""
         self.playing: deque[tuple[float, Action]] = deque()
         """What the script being played has yet to do, and when."""
+        self._slot: int | None = None
+        """The slot that was named last, of which the script is played."""
+        self._left: dict[int, deque[tuple[float, Action]]] = {}
+        """What scripts had yet to do when another slot was named: they go on when theirs is named again."""
         self._memory = memory
         self._answer_s = answer_s
         self._old = version == "2012"
@@ -203,6 +207,7 @@ class MityaBody(Robot):
         slot = value & 0xFF
         if slot >= SLOTS:
             return []
+        self._name(slot)
         if value >> 8:
             self.recording, self._begun = slot, None
             return []
@@ -255,10 +260,21 @@ class MityaBody(Robot):
         if self.recording is None:
             return []
         self._free(self.recording)
+        self._name(None)
         self.recording = self._begun = None
         return [b"r0200"]
 
+    def _name(self, slot: int | None) -> None:
+        if slot != self._slot:
+            if self._slot is not None:
+                self._left[self._slot] = self.playing
+            self.playing = deque() if slot is None else self._left.pop(slot, deque())
+            self._slot = slot
+
     def _free(self, slot: int) -> None:
+        self._left.pop(slot, None)
+        if slot == self._slot:
+            self.playing.clear()
         self.scripts.pop(slot, None)
         self._room.pop(slot, None)
 
