@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from pydantic_core import from_json
 
 from psiu_broker.bus.keys import KEY_LENGTH_MAX, Keys
-from psiu_broker.bus.session import JSON, plain, tls_links
+from psiu_broker.bus.session import JSON, LEASE, plain, tls_links
 from psiu_broker.config import TlsConfiguration
 from psiu_broker.config.certificates import read_certificate
 from psiu_broker.errors import BusError, CallError, PsiuError
@@ -68,8 +68,9 @@ class Client:
 
         Raises:
             CallError: the only answer was a refusal.
+            BusError: an answer is no JSON.
         """
-        return {found: from_json(payload) for found, payload in self._get(key, timeout_s)}
+        return {found: _json(found, payload) for found, payload in self._get(key, timeout_s)}
 
     def ask(self, *what: str, broker: str | None = None, timeout_s: float = 3.0) -> dict[str, Any]:
         """``ask("links")`` or ``ask("why", "A", "B")`` of one broker or all: the JSON values by broker.
@@ -101,7 +102,7 @@ class Client:
         wait_s = CALL_TIMEOUT_S if request.timeout_s is None else request.timeout_s + DEADLINE_MARGIN_S
         found = self._get(self._call_key(robot, command), wait_s, self._signed(request))
         if not found:
-            self._refuse_where_denied()
+            self.refuse_where_denied()
             if self.brokers():
                 raise CallError(
                     "outcome_unknown", "the broker that has the robot went away; it may have been done or not"
@@ -119,7 +120,7 @@ class Client:
             CallError: the broker would not take it from us.
         """
         request = request or CallRequest()
-        self._refuse_where_denied()
+        self.refuse_where_denied()
         try:
             self._session.put(
                 self._call_key(robot, command),
@@ -130,6 +131,24 @@ class Client:
             )
         except zenoh.ZError as error:
             raise BusError(f"zenoh: {plain(error)}") from error
+
+    def refuse_where_denied(self) -> None:
+        """To be asked where a command has no answer: of what a broker's rules deny Zenoh tells nothing.
+
+        Raises:
+            CallError: they let us only listen.
+        """
+        if self._tls is None:
+            return
+        if not self._asked_rights:
+            name = read_certificate(self._tls.certificate).name
+            for broker, config in self.ask("config").items():
+                if name not in _commanders(config, name):
+                    text = f"broker {broker} lets {name} only listen; nothing was sent"
+                    self._denial = CallError("refused", f"{text} (zenoh.access in its configuration)")
+            self._asked_rights = True
+        if self._denial is not None:
+            raise self._denial
 
     def monitor(self, key: str) -> Iterator[tuple[str, Literal["put", "delete"], bytes]]:
         """Every put and delete under `key` (wildcards allowed) as key, kind and payload, until interrupted."""
@@ -156,21 +175,6 @@ class Client:
         finally:
             with suppress(zenoh.ZError):
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
-
-    def _refuse_where_denied(self) -> None:
-        """Raise CallError where a broker's rules let us call nobody. Of what they deny Zenoh tells nothing."""
-        if self._tls is None:
-            return
-        if not self._asked_rights:
-            name = read_certificate(self._tls.certificate).name
-            for broker, config in self.ask("config").items():
-                access = config["zenoh"].get("access")
-                if access is not None and name not in (*access["brokers"], *access["commanders"]):
-                    text = f"broker {broker} lets {name} only listen; nothing was sent"
-                    self._denial = CallError("refused", f"{text} (zenoh.access in its configuration)")
-            self._asked_rights = True
-        if self._denial is not None:
-            raise self._denial
 
     def _signed(self, request: CallRequest) -> str:
         """`request` as one of this program, whose token is there from now on."""
@@ -239,7 +243,8 @@ def _configuration(endpoints: list[str], timeout_s: float, tls: TlsConfiguration
         "scouting": {"multicast": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {} if tls is None else tls_links(tls, endpoints),
+            # As brokers: a program that is cut off or hangs is missed as soon.
+            "link": {"tx": LEASE} | ({} if tls is None else tls_links(tls, endpoints)),
         },
     }
 
@@ -253,6 +258,22 @@ def _checked(key: str) -> str:
     except (zenoh.ZError, UnicodeEncodeError) as error:
         raise BusError(f"not a key: {plain(error)}") from error
     return key
+
+
+def _json(key: str, payload: bytes) -> Any:
+    try:
+        return from_json(payload)
+    except ValueError as error:
+        raise BusError(f"the broker's answer cannot be read: {key} is no JSON: {error}") from error
+
+
+def _commanders(config: Any, default: str) -> Sequence[str]:
+    """Whom a broker with that configuration lets command; `default` where it does not say."""
+    try:
+        access = config["zenoh"]["access"]
+        return (*access["brokers"], *access["commanders"])
+    except (KeyError, TypeError):  # no rules; or told in words that this program does not know
+        return (default,)
 
 
 def _refusal(payload: bytes, timeout_s: float) -> PsiuError:

@@ -1,8 +1,8 @@
 """Programs that want to be missed: a token ``psiu/@program/{id}``, and ``"program": id`` in each of their calls.
 
-The token vanishes with its session: at once where the program ends or is killed, within the lease of its session
-(10 s unless it chose another) where it is cut off. One who goes in good order declares ``psiu/@program/{id}/done``
-first.
+The token vanishes with its session: at once where the program ends or is killed; where it hangs or is cut off, within
+the lease that its session announces (10 s unless it chose another; `Client` has a broker's). One who goes in good
+order declares ``psiu/@program/{id}/done`` first.
 
 Zenoh 1.10 tells nothing of who made a query or a put unless that adds it, and of sessions only where they are direct:
 a token is seen through routers too, and any program can declare one.

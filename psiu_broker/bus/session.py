@@ -29,6 +29,11 @@ _SOURCE_PLACE: Final = re.compile(r"\s*at /[^\s\]]+\.rs:\d+\.?")
 _BUSY: Final = re.compile(r"bound to (?P<endpoint>\S+): .*(?:already in use|os error 98)", re.DOTALL)
 _THREAD_END_S: Final = 5.0
 
+LEASE_S: Final = 2.0
+"""How long others wait for a sign of life of ours before they give us up: Zenoh goes by what each side announces."""
+
+LEASE: Final = {"lease": int(LEASE_S * 1000), "keep_alive": 4}
+
 STUCK_S: Final = 1.0
 """How long a reply waits for a program that does not read; then Zenoh closes the link to it."""
 
@@ -298,8 +303,7 @@ def _configuration(listen: Sequence[str], connect: Sequence[str], mode: Mode, di
             "shared_memory": {"enabled": False},
             "link": {
                 "tx": {
-                    "lease": 2000,
-                    "keep_alive": 4,
+                    **LEASE,
                     "queue": {"congestion_control": {"block": {"wait_before_close": int(STUCK_S * 1e6)}}},
                 },
             },

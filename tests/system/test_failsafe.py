@@ -22,11 +22,12 @@ def test_a_program_that_is_killed_is_missed_at_once(how: str) -> None:
         assert here.listen(1.5) == [], "a stop that was answered is not repeated"
 
 
-def test_a_program_that_hangs_is_missed_within_its_lease() -> None:
+@pytest.mark.parametrize(("how", "within_s"), [("call", 15), ("client", 6)], ids=["Zenoh's own", "our client's"])
+def test_a_program_that_hangs_is_missed_within_its_lease(how: str, within_s: float) -> None:
     with lab(FAILSAFE) as here:
-        program = here.program("call")
+        program = here.program(how)
         program.send_signal(signal.SIGSTOP)
-        here.until("pare", 15)
+        here.until("pare", within_s)
 
 
 def test_a_robot_that_does_not_answer_its_stop_is_told_only_so_often() -> None:
