@@ -63,6 +63,9 @@ class Kept(ABC):
     def _down(self, reason: str) -> None:
         """Forget the connection, if there is one: it is of no more use. Neither waits nor raises."""
 
+    async def _leave(self, transport: Transport) -> None:  # noqa: B027 - most have nothing to say
+        """Wait, not for long, until what is to be said last on `transport` has been taken; it is closed then."""
+
     async def run(self) -> None:
         """Keep it open for ever: what fails waits and is tried again. Ends only when cancelled."""
         try:
@@ -94,7 +97,11 @@ class Kept(ABC):
         finally:
             self._down("closed")
             try:
-                await transport.close()
+                try:
+                    if self._lost.cancelled():  # it was told to end, and the transport is alive
+                        await self._leave(transport)
+                finally:
+                    await transport.close()
             except Exception:  # it must not hide why the link ends, least of all that it was told to
                 log.exception("%s %s: its adapter failed to close", self.kind, self.name)
 

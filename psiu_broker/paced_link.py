@@ -4,7 +4,7 @@ A frame that is offered waits for the next packet and is delivered with it. Its 
 every packet, until a newer one comes or it is too old; then, and while nobody has told the robot anything,
 its share is what stops it. So the packets go on, whether there is news or not, for as long as the link is
 open: from its opening, or, where the codec is not `steady`, from the first set-point that it was ever
-offered. The last packet before the link is closed stops every robot, if the line has room for it.
+offered. The last packet before the link is closed stops every robot; closing waits until the line has room for it.
 
 A line is one team: the packet goes to all its far ends, and a robot is known by its number alone.
 """
@@ -32,6 +32,9 @@ PACKET: Final = "packet"
 
 PERIODS_KEPT: Final = 1000
 """Over how many of the last packets the jitter is told: half a minute at 30 Hz."""
+
+LAST_PACKET_S: Final = 0.5
+"""How long closing waits for room."""
 
 
 class Pace:
@@ -114,6 +117,9 @@ class PacedLink(Link):
         """What each robot was told last, and until when it holds."""
         self._call_at = call_at
         self._timer: Timer | None = None
+        self._unstopped: list[Peer] = []
+        """Far ends for which the last packet found no room."""
+        self._room: asyncio.Event = asyncio.Event()
         self._stops = self._packets.packet([self._rests[robot].stop for robot in sorted(self._rests)])
 
     def connected(self, transport: Transport) -> None:
@@ -122,7 +128,8 @@ class PacedLink(Link):
             self._begin()
 
     def writable(self) -> None:
-        """Nothing: a packet that found no room is not sent late, the next one is newer."""
+        """Nothing but for the last packet: any other that found no room is not sent late, the next one is newer."""
+        self._room.set()
 
     def offer(
         self, frame: Frame, peer: Peer, arrived: Way, now: float, patience_s: float = inf, fate: Fate | None = None
@@ -218,7 +225,21 @@ class PacedLink(Link):
             self._timer.cancel()
             self._timer = None
             # Robots that do not stop by themselves in a silence would go on for ever.
-            for peer in tuple(transport.peers):
-                transport.write(self._stops, peer)
+            self._unstopped = list(transport.peers)
+            self._stop_all(transport)
         self._held.clear()
         super()._down(reason)
+
+    async def _leave(self, transport: Transport) -> None:
+        try:
+            async with asyncio.timeout(LAST_PACKET_S):
+                while self._unstopped:
+                    await self._room.wait()
+                    self._stop_all(transport)
+        except TimeoutError:
+            log.warning("link %s: closed without room for the packet that stops its robots", self.name)
+
+    def _stop_all(self, transport: Transport) -> None:
+        """Tell to stop who was not told yet, as far as there is room."""
+        self._room.clear()
+        self._unstopped = [peer for peer in self._unstopped if not transport.write(self._stops, peer)]

@@ -17,7 +17,7 @@ from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport
 
 from psiu_adapters.serial import Serial
 from psiu_adapters.udp import Udp
-from psiu_broker import kept
+from psiu_broker import kept, paced_link
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs.codec import Directory
 from psiu_broker.codecs.paced import Rest
@@ -616,6 +616,42 @@ async def test_robots_stop_when_the_broker_does(tmp_path: Path) -> None:
         task.cancel()
         await task
         await port.until(lambda: team[0].wheels == (0, 0))
+
+
+async def test_closing_waits_for_room_for_the_packet_that_stops_the_robots() -> None:
+    adapter = MemoryAdapter()
+    link = PacedLink(made := configuration(adapter), lambda: Soccer(cast(Any, made.codec)), cast(Hub, Ledger()))
+    task = asyncio.create_task(run(link))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    adapter.transport.full = True
+    task.cancel()
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not adapter.transport.closed
+    adapter.transport.full = False
+    before = len(adapter.transport.written)
+    link.writable()
+    await task
+    assert [wire.hex() for wire in adapter.transport.wires[before:]] == [STOPPED]
+    assert adapter.transport.closed
+
+
+async def test_closing_does_not_wait_for_room_without_end(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(paced_link, "LAST_PACKET_S", 0.01)
+    adapter = MemoryAdapter(ends=("a", "b"))
+    link = PacedLink(made := configuration(adapter), lambda: Soccer(cast(Any, made.codec)), cast(Hub, Ledger()))
+    task = asyncio.create_task(run(link))
+    for _ in range(5):
+        await asyncio.sleep(0)
+    adapter.transport.full_peers = {"b"}
+    task.cancel()
+    await task
+    assert adapter.transport.written[-1] == (bytes.fromhex(STOPPED), "a")
+    assert adapter.transport.closed
+    assert "closed without room for the packet that stops its robots" in caplog.text
 
 
 async def test_a_team_over_udp_is_driven() -> None:
