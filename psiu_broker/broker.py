@@ -163,15 +163,9 @@ class Broker:
         self._link_tasks = [create(each.run(), name=f"{each.kind} {each.name}") for each in kept]
 
     async def stop(self) -> None:
-        """Refuse new calls, let what waits go out, close the links, then the bus."""
-        for task in self._tasks:
-            if task.get_name() == "bus":
-                # Else it might open another session meanwhile, of which nobody takes leave.
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-        if self._bus is not None:
-            await self._bus.retire()
-        await self.resident.close()
+        """Refuse new calls, stop robots that are to be, let what waits go out, close the links, then the bus."""
+        # At once: programs that do not read their replies must not hold up what stops robots.
+        await asyncio.gather(self._retire_bus(), self.resident.close())
         try:
             async with asyncio.timeout(DRAIN_S):
                 await asyncio.gather(*(link.drained() for link in self.exchange.links.values()))
@@ -377,6 +371,15 @@ class Broker:
         )
 
     # Inside: the bus, opened and kept open.
+
+    async def _retire_bus(self) -> None:
+        for task in self._tasks:
+            if task.get_name() == "bus":
+                # Else it might open another session meanwhile, of which nobody takes leave.
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        if self._bus is not None:
+            await self._bus.retire()
 
     async def _open_bus(self) -> None:
         self._bus = await Bus.open(self.configuration, self, self._bus_lost.set, *self._trunks.meet())

@@ -373,6 +373,21 @@ async def test_a_call_that_came_while_the_broker_stood_still_moves_nothing(lab: 
     assert (await lab.call("MNERIM", "parafrente", 1)).status == "sucesso"
 
 
+async def test_programs_that_do_not_read_their_replies_do_not_hold_up_what_stops_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Lab(tmp_path)
+    with made.file.open("a") as file:
+        file.write('[robots.MNERIM]\nlink = "radio"\nfailsafe = { command = "pare" }\n')
+    made.broker = Broker(load(made.file))
+    async with made as lab:
+        await lab.call("MNERIM", "parafrente", 100)
+        assert lab.broker._bus is not None
+        told = lambda: any(heard.subject == "pare" for heard in lab.mnerim.heard)  # noqa: E731
+        monkeypatch.setattr(lab.broker._bus, "retire", lambda: until(told))
+        await lab.broker.stop()
+
+
 async def test_a_broker_that_stops_opens_no_bus_again(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[object] = []
     keeper = next(task for task in lab.broker._tasks if task.get_name() == "bus")
