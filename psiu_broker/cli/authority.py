@@ -29,10 +29,10 @@ class Authority:
 
         Raises:
             OSError: a file cannot be read or written.
-            ValueError: ca.pem or ca.key is none, or only the key is there.
+            ValueError: ca.pem or ca.key is none, only one of them is there, or they do not belong together.
         """
         self.folder = folder
-        self._now = now or datetime.now(UTC)
+        self._now = (now or datetime.now(UTC)).replace(microsecond=0)  # as certificates tell it
         self.is_new = not (folder / "ca.pem").exists()
         if self.is_new and (folder / "ca.key").exists():
             raise ValueError(f"{folder / 'ca.key'} is there without ca.pem; put that back, or take both away")
@@ -49,10 +49,7 @@ class Authority:
             _write(folder, CA, self._certificate, self._key)
         else:
             self._certificate = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
-            key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), None)
-            if not isinstance(key, ec.EllipticCurvePrivateKey):
-                raise ValueError(f"{folder / 'ca.key'}: expected the key of an elliptic curve")
-            self._key = key
+            self._key = _read_key(folder / "ca.key", self._certificate)
 
     def make(self, name: str, days: int, *, broker: bool) -> None:
         """Write the key and the certificate of `name`, in place of those that are there.
@@ -62,7 +59,13 @@ class Authority:
 
         Raises:
             OSError: a file cannot be written.
+            ValueError: it would outlive the authority.
         """
+        end = self._certificate.not_valid_after_utc
+        if self._now + timedelta(days=days) > end:
+            left = (end - self._now).days
+            how = f"--days {left} at most, or begin" if left > 0 else "begin"
+            raise ValueError(f"ca.pem ends on {end:%Y-%m-%d}, in less than {days} days; {how} anew in another folder")
         key = ec.generate_private_key(ec.SECP256R1())
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if broker else [])]
         certificate = _sign(
@@ -89,6 +92,18 @@ class Authority:
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
             .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)
         )
+
+
+def _read_key(file: Path, certificate: x509.Certificate) -> ec.EllipticCurvePrivateKey:
+    if not file.exists():
+        raise ValueError(f"{file.name} is not there, which makes more; put it back, or begin anew in another folder")
+    try:
+        key = serialization.load_pem_private_key(file.read_bytes(), None)
+    except TypeError as error:
+        raise ValueError(f"{file.name} has a password; take it off: openssl pkey -in {file} -out {file}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise ValueError(f"{file.name} is not the key of ca.pem, which psiu-broker keys made; put the right one there")
+    return key
 
 
 def _sign(builder: x509.CertificateBuilder, key: ec.EllipticCurvePrivateKey) -> x509.Certificate:

@@ -5,13 +5,16 @@ import shutil
 import stat
 import sys
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from cryptography.hazmat.primitives import serialization
 from secure_keys import files
 
+from psiu_broker.cli.authority import Authority
 from psiu_broker.cli.tool import psiu
 from psiu_broker.config import load
 from psiu_broker.config.certificates import problem, read_certificate
@@ -122,8 +125,39 @@ def test_a_folder_without_the_authority_s_key_makes_none(daemon: Run, tmp_path: 
     daemon("keys", str(tmp_path), "--broker", "base")
     (tmp_path / "ca.key").unlink()
     refused = daemon("keys", str(tmp_path), "--broker", "hill")
-    assert (refused.exit_code, "ca.key" in refused.stderr) == (1, True)
+    assert (refused.exit_code, "ca.key is not there, which makes more; put it back" in refused.stderr) == (1, True)
     assert not (tmp_path / "hill.key").exists()
+
+
+def test_an_authority_s_key_that_is_another_s_or_has_a_password_makes_none(daemon: Run, tmp_path: Path) -> None:
+    for folder in ("ours", "others"):
+        assert daemon("keys", str(tmp_path / folder), "--broker", "base").exit_code == 0
+    secret = tmp_path / "ours" / "ca.key"
+    ours = serialization.load_pem_private_key(secret.read_bytes(), None)
+    locked = ours.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.BestAvailableEncryption(b"word")
+    )
+    for data, said in (
+        (locked, "ca.key has a password; take it off: "),
+        ((tmp_path / "others" / "ca.key").read_bytes(), "ca.key is not the key of ca.pem"),
+        (b"", "ours: "),
+    ):
+        secret.write_bytes(data)
+        refused = daemon("keys", str(tmp_path / "ours"), "--broker", "base", "--renew")
+        assert (refused.exit_code, said in refused.stderr, refused.stderr.count("\n")) == (1, True, 1), refused.output
+    assert problem(files(tmp_path / "ours", "base"), serves=True) is None, "what was there is there still"
+
+
+def test_nobody_is_told_that_a_certificate_is_good_for_longer_than_its_authority(daemon: Run, tmp_path: Path) -> None:
+    assert daemon("keys", str(tmp_path / "now"), "--broker", "base", "--days", "3650").exit_code == 0
+    begun = datetime.now(UTC) - timedelta(days=3600, hours=12)
+    Authority(tmp_path, begun).make("base", 3650, broker=True)
+    refused = daemon("keys", str(tmp_path), "--program", "operator")
+    assert refused.exit_code == 1
+    end = begun + timedelta(days=3650)
+    text = f"ca.pem ends on {end:%Y-%m-%d}, in less than 730 days; --days 49 at most, or begin anew in another folder"
+    assert text in refused.stderr
+    assert daemon("keys", str(tmp_path), "--program", "operator", "--days", "49").exit_code == 0
 
 
 def test_an_authority_s_key_without_its_certificate_is_left_as_it_is(daemon: Run, tmp_path: Path) -> None:
