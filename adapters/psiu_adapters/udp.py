@@ -33,6 +33,9 @@ from psiu_broker.errors import LinkAbsent, LinkError, LinkLost
 
 DATAGRAM_BYTES = 2048
 DRAIN_DATAGRAMS = 32
+DRAIN_BYTES = 4096
+"""Where a turn of this link ends, whichever comes first: the other links wait for it, and a byte of garbage takes as
+long here as on a stream, of which a turn reads no more."""
 SWEEPS = 4
 OTHER_PORTS = 256
 """How many of the ports that peers send from are remembered; the rest are looked up each time."""
@@ -277,6 +280,7 @@ class _UdpTransport(Transport):
         too_long = DATAGRAM_BYTES + 1
 
         def read() -> None:
+            room = DRAIN_BYTES
             for _ in turns:
                 try:
                     data, address = recvfrom(too_long)
@@ -293,10 +297,14 @@ class _UdpTransport(Transport):
                     if entry is None:
                         continue
                 entry.silent = 0
-                if len(data) == too_long:
+                size = len(data)
+                if size == too_long:
                     self._oversized += 1
                     data = data[:-1]
                 received(data, entry.peer)
+                room -= size
+                if room <= 0:
+                    return
 
         return read
 

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from udp_robot import Robot, open_for
 
 from psiu_adapters import udp, udp_sockets
+from psiu_adapters.descriptor import READ_BYTES
 from psiu_adapters.udp import Udp
 from psiu_broker.adapter import Adapter
 from psiu_broker.errors import LinkAbsent, LinkBusy
@@ -69,6 +70,17 @@ class TestPeers:
         await recorder.until(lambda: recorder.heard)
         assert len(recorder.heard) == udp.DRAIN_DATAGRAMS
         await recorder.until(lambda: len(recorder.heard) == 3 * udp.DRAIN_DATAGRAMS)
+        await transport.close()
+
+    async def test_a_flood_of_long_datagrams_gets_no_more_bytes_a_turn_than_a_stream(
+        self, robot: Robot, recorder: Recorder
+    ) -> None:
+        transport = await open_for(recorder, [robot])
+        for _ in range(20):
+            await robot.say(bytes(udp.DATAGRAM_BYTES))
+        await recorder.until(lambda: recorder.heard)
+        assert len(recorder.heard) == READ_BYTES / udp.DATAGRAM_BYTES
+        await recorder.until(lambda: len(recorder.heard) == 20)
         await transport.close()
 
     async def test_an_empty_datagram_is_not_the_end(self, robot: Robot, recorder: Recorder) -> None:
