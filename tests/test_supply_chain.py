@@ -83,6 +83,12 @@ def test_each_package_of_the_lock_is_known_by_its_hash() -> None:
     assert all("==" in line and "--hash=sha256:" in line for line in pins)
 
 
+def test_ci_builds_with_what_the_lock_names_and_fetches_nothing_else_for_that() -> None:
+    builds = re.findall(r"^.*-m build .*$", (ROOT / ".ci/run").read_text(), re.MULTILINE)
+    assert builds
+    assert all("--no-isolation" in line for line in builds)
+
+
 GOOD = {"name": "click", "version": "8.3.1", "vulns": []}
 BAD = {"name": "pillow", "version": "1.0", "vulns": [{"id": "PYSEC-2026-1", "fix_versions": []}]}
 SKIPPED = {"name": "attrs", "skip_reason": "Dependency not found on PyPI and could not be audited"}
