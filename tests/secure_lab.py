@@ -133,6 +133,10 @@ class SecureLab:
             await broker.stop()
         await self._port.close()
 
+    def say(self, data: bytes) -> None:
+        """The robot speaks."""
+        self._port.send(data)
+
     def program(self, name: str, mode: str = "client") -> Any:
         return program(self.endpoints[0], files(self.keys, name), mode)
 

@@ -1,14 +1,13 @@
 """`psiu conflicts`: names that more than one robot, or broker, has, and the operator's word on them."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import click
 
 from psiu_broker.cli.commands import examples
 from psiu_broker.cli.connection import Connection, connects
-from psiu_broker.cli.output import on_terminal, print_json, print_rows, print_table
-from psiu_broker.cli.tables import with_brokers
+from psiu_broker.cli.output import on_terminal, print_rows, print_table
+from psiu_broker.cli.tables import ask_each, print_each, with_brokers
 from psiu_broker.messages import Conflict
 
 
@@ -33,18 +32,18 @@ def conflicts(connection: Connection, release: tuple[str, str] | None) -> None:
     In a pipe each line has, between tabs: robot, brokers, the link that has the name, links that are held back, frames
     turned away there, since, detail, broker that says so. With --json: a list (psiu schema Conflict).
     """
-    with connection.client() as client:
-        told = client.ask("conflicts") if release is None else client.ask("release", *release)
-        if not told and not client.brokers():
-            raise connection.nobody()
+    if release is not None:
+        with connection.client() as client:
+            if not client.ask("release", *release):
+                client.refuse_where_denied()
+    told = ask_each(connection, Conflict, "conflicts")
     if connection.as_json:
-        print_json([{"broker": broker, **each} for broker in sorted(told) for each in told[broker]])
+        print_each(told)
     else:
-        show_conflicts(told, drawn=on_terminal())
+        show_conflicts([(broker, conflict) for broker, conflict, _ in told], drawn=on_terminal())
 
 
-def show_conflicts(told: Mapping[str, Sequence[Any]], *, drawn: bool) -> None:
-    found = [(broker, Conflict.model_validate(each)) for broker in sorted(told) for each in told[broker]]
+def show_conflicts(found: Sequence[tuple[str, Conflict]], *, drawn: bool) -> None:
     if not drawn:
         print_rows(
             (c.robot, " ".join(c.brokers), c.link, " ".join(c.held_back), c.frames, c.since, c.detail, broker)

@@ -46,7 +46,10 @@ class Connection:
 
     @contextmanager
     def client(self) -> Iterator[Client]:
-        """A client for as long as the block lasts; what fails inside ends the command."""
+        """A client for as long as the block lasts; what fails inside ends the command.
+
+        Answers are validated inside: one that cannot be read ends it too.
+        """
         try:
             with Client(self.endpoints, self.prefix, self.tls) as client:
                 yield client
@@ -55,7 +58,7 @@ class Connection:
         except PsiuError as error:
             raise self.failure(NO_BROKER, str(error)) from error
         except ValidationError as error:
-            raise self.failure(NO_BROKER, "the broker's answer cannot be read; is it newer than this psiu?") from error
+            raise self.failure(NO_BROKER, _unreadable(error)) from error
         except ValueError as error:  # a name that no key can carry
             raise self.failure("bad_request", str(error)) from error
 
@@ -71,6 +74,13 @@ class Connection:
             name = Path(self.tls.certificate).stem
             return self.failure(NO_BROKER, f"no broker at {places} lets {name} know; see its [zenoh.access]")
         return self.failure(NO_BROKER, f"there is no broker at {places}")
+
+
+def _unreadable(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    place = ".".join(map(str, (error.title, *first["loc"])))
+    said = f"the broker's answer cannot be read ({place}: {first['msg'][:1].lower()}{first['msg'][1:]})"
+    return f"{said}; is it of another version than this psiu?"
 
 
 def connects(command: Callable[Concatenate[Connection, P], R]) -> Callable[..., R]:

@@ -64,7 +64,8 @@ def why(connection: Connection, a: str, b: str, broker: str | None) -> None:
     """
     with connection.client() as client:
         told = client.ask("why", a, b)
-        decisions = {name: Why.model_validate({**told[name], "broker": name}) for name in sorted(told)}
+        read = {name: Why.model_validate(told[name]) for name in sorted(told)}
+    decisions = {name: each.model_copy(update={"broker": name}) for name, each in read.items()}
     if not decisions:
         raise connection.nobody()
     if broker is not None and broker not in decisions:
@@ -99,8 +100,10 @@ def trace(connection: Connection, a: str, b: str) -> None:
     with connection.client() as client:
         told = client.ask("trace", a, b, timeout_s=TRACE_TIMEOUT_S)
         traces = [Trace.model_validate(told[name]) for name in sorted(told)]
-        if not traces and not client.brokers():
-            raise connection.nobody()
+        if not traces:
+            client.refuse_where_denied()
+            if not client.brokers():
+                raise connection.nobody()
     if not traces:
         raise connection.failure("unknown_robot", f"{a} is on no broker: psiu robots lists who is known")
     if connection.as_json:

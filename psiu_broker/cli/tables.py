@@ -1,9 +1,10 @@
 """What the brokers know: `psiu robots`, `links`, `routes` and `status`."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import click
+from pydantic import BaseModel, TypeAdapter
 
 from psiu_broker.cli.commands import examples
 from psiu_broker.cli.connection import Connection, connects
@@ -21,8 +22,7 @@ from psiu_broker.cli.output import (
 from psiu_broker.messages import Card, Command, Health, Link, Route, Status, Trunk
 from psiu_broker.profiles.psiu import QUESTIONS
 
-Told = Sequence[tuple[str, Any]]
-"""What each broker told of a thing, by its name."""
+M = TypeVar("M", bound=BaseModel)
 
 Links = Sequence[tuple[str, Link]]
 Routes = Sequence[tuple[str, Route]]
@@ -73,14 +73,13 @@ def links(connection: Connection) -> None:
     On a terminal the trunks to other brokers follow, where there are any; a program gets them from the key
     psiu/@broker/{broker}/trunks (psiu schema Trunk).
     """
-    told = _ask(connection, "links")
+    told = ask_each(connection, Link, "links")
     if connection.as_json:
-        _print_each(told)
+        print_each(told)
         return
-    show_links([(broker, Link.model_validate(link)) for broker, found in told for link in found], drawn=on_terminal())
+    show_links([(broker, link) for broker, link, _ in told], drawn=on_terminal())
     if on_terminal():
-        told = _ask(connection, "trunks")
-        show_trunks([(broker, Trunk.model_validate(trunk)) for broker, found in told for trunk in found])
+        show_trunks([(broker, trunk) for broker, trunk, _ in ask_each(connection, Trunk, "trunks")])
 
 
 @click.command(epilog=examples("psiu routes", "psiu routes --json"))
@@ -91,11 +90,11 @@ def routes(connection: Connection) -> None:
     In a pipe each line has, between tabs: robot, link, peer, origin, age in s, expires in s, broker.
     With --json: a list (psiu schema Route).
     """
-    told = _ask(connection, "routes")
+    told = ask_each(connection, Route, "routes")
     if connection.as_json:
-        _print_each(told)
-        return
-    show_routes([(broker, Route.model_validate(route)) for broker, found in told for route in found])
+        print_each(told)
+    else:
+        show_routes([(broker, route) for broker, route, _ in told])
 
 
 @click.command(epilog=examples("psiu status", "psiu status --json | jq '.[].healthy'"))
@@ -109,9 +108,9 @@ def status(connection: Connection) -> None:
     with connection.client() as client:
         statuses = client.brokers()
         healths = client.ask("health")
-    if not statuses:
+        found = [(each, Health.model_validate(healths.get(each.broker, _UNKNOWN))) for each in statuses]
+    if not found:
         raise connection.nobody()
-    found = [(each, Health.model_validate(healths.get(each.broker, _UNKNOWN))) for each in statuses]
     if connection.as_json:
         print_json([{**each.model_dump(mode="json"), **health.model_dump(mode="json")} for each, health in found])
     else:
@@ -243,16 +242,23 @@ def show_status(found: Iterable[tuple[Status, Health]]) -> None:
 _UNKNOWN: Final[Mapping[str, object]] = {"healthy": False, "checks": {"answers": False}}
 
 
-def _ask(connection: Connection, *what: str) -> Told:
+def ask_each(connection: Connection, model: type[M], *what: str) -> Sequence[tuple[str, M, Any]]:
+    """What each broker lists, item by item: the broker, the item, and its JSON, which may say more."""
     with connection.client() as client:
-        told = sorted(client.ask(*what).items())
+        told = client.ask(*what)
+        items = TypeAdapter(list[model])  # type: ignore[valid-type]
+        found = [
+            (broker, item, raw)
+            for broker, raws in sorted(told.items())
+            for item, raw in zip(items.validate_python(raws), raws, strict=True)
+        ]
     if not told:
         raise connection.nobody()
-    return told
+    return found
 
 
-def _print_each(told: Told) -> None:
-    print_json([{"broker": broker, **each} for broker, found in told for each in found])
+def print_each(told: Sequence[tuple[str, Any, Any]]) -> None:
+    print_json([{"broker": broker, **each} for broker, _, each in told])
 
 
 def with_brokers(columns: Sequence[str], rows: Rows) -> tuple[Sequence[str], Sequence[Sequence[Cell]]]:

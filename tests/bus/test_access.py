@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -10,15 +11,19 @@ from typing import Any
 
 import pytest
 import zenoh
+from click.testing import CliRunner
 from ports import free_port
 from secure_keys import files, make_keys
 from secure_lab import FORGED, REMOTE, SecureLab, Spy, program, until, zenoh_config
 
 from psiu_broker.broker import Broker
 from psiu_broker.bus.access import EVERYTHING, access_control
+from psiu_broker.cli import tool
 from psiu_broker.config import ZenohConfiguration, load
 from psiu_broker.errors import CallError
 from psiu_broker.messages import CallRequest
+from psiu_broker.routing.quarantine import TURNS
+from psiu_broker.simulator import AsciiRobot
 
 BUS = Path(__file__).parents[2] / "psiu_broker/bus"
 SEVERAL = pytest.mark.parametrize("mode", ["peer", "router"])
@@ -354,6 +359,69 @@ async def test_the_tool_is_told_why_its_call_goes_nowhere(lab: SecureLab) -> Non
             with pytest.raises(CallError, match="broker base lets screen only listen; nothing was sent") as caught:
                 await asyncio.to_thread(tell, "MNERIM", "quantoscomandos")
             assert caught.value.code == "refused"
+
+
+async def twins(lab: SecureLab, cable: int) -> None:
+    """MNERIM speaks on the Wi-Fi, and another MNERIM by the cable, by turns, until the latter is held back."""
+    [base] = lab.brokers
+    other = AsciiRobot("MNERIM")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for turn in range(2 * TURNS):
+            link = base.exchange.links["cable" if turn % 2 else "wifi"]
+            before = link.frames_in
+            if turn % 2:
+                sender.sendto(other.say("base", "distancia", turn), ("127.0.0.1", cable))
+            else:
+                lab.say(lab.robot.say("base", "distancia", turn))
+            await until(lambda link=link, before=before: link.frames_in > before)  # type: ignore[misc]
+    assert [each.held_back for each in base.conflicts()] == [["cable"]]
+
+
+async def test_a_conflict_is_told_to_who_listens_and_is_a_commander_s_to_end(tmp_path: Path) -> None:
+    cable = free_port(socket.SOCK_DGRAM)
+    links = f'[links.cable]\nadapter = "udp"\nlisten = "127.0.0.1:{cable}"\nprotocol = "psiu-ascii"\n'
+    async with SecureLab(tmp_path, extra=links) as lab:
+        [base] = lab.brokers
+        release = "psiu/@broker/base/release/MNERIM/cable"
+        with lab.program("screen") as screen, lab.program("operator") as operator:
+            told: list[Any] = []
+            subscribed = [
+                each.declare_subscriber(key, lambda sample: told.append(json.loads(sample.payload.to_bytes())))
+                for each, key in ((screen, "psiu/@broker/*/conflicts"), (operator, "psiu/@broker/base/conflicts"))
+            ]
+            await got(screen, "psiu/@broker/base/status")
+            await got(operator, "psiu/@broker/base/status")
+            await twins(lab, cable)
+            await until(lambda: len(told) == 2)
+            assert [each["held_back"] for conflicts in told for each in conflicts] == [["cable"], ["cable"]]
+            assert [each["robot"] for each in (await got(screen, "psiu/@broker/*/conflicts")).popitem()[1]] == [
+                "MNERIM"
+            ]
+            for key in (release, release.replace("base", "*"), "psiu/@broker/**", "psiu/@broker/base/release/*/*"):
+                assert await got(screen, key) == {}
+            assert await psiu(lab, "screen", "conflicts", "--release", "MNERIM", "cable") == (
+                3,
+                "psiu: broker base lets screen only listen; nothing was sent (zenoh.access in its configuration)\n",
+            )
+            assert len(base.conflicts()) == 1
+            assert await got(operator, release) == {release: []}
+            assert base.conflicts() == []
+            await until(lambda: told[2:] == [[], []])
+            del subscribed
+
+
+async def test_a_listener_s_trace_is_not_taken_for_one_of_a_robot_that_nobody_has(lab: SecureLab) -> None:
+    code, text = await psiu(lab, "screen", "trace", "base", "MNERIM")
+    assert (code, "lets screen only listen" in text) == (3, True)
+    code, text = await psiu(lab, "operator", "trace", "GHOST", "MNERIM")
+    assert (code, "GHOST is on no broker" in text) == (3, True)
+
+
+async def psiu(lab: SecureLab, name: str, *words: str) -> tuple[int, str]:
+    """How `psiu` with these words ends for one with that certificate, and what it says on stderr."""
+    own = ("--connect", lab.endpoints[0], "--keys", str(lab.keys / name))
+    result = await asyncio.to_thread(CliRunner().invoke, tool.psiu, (*words, *own), prog_name="psiu")
+    return result.exit_code, result.stderr
 
 
 def test_every_word_of_the_bus_is_known_to_the_rules() -> None:

@@ -82,5 +82,32 @@ def test_books_that_do_not_balance_are_shown_while_watching(lab: Any, monkeypatc
     monkeypatch.setattr(Client, "ask", ask)
     monkeypatch.setattr("psiu_broker.cli.ledger.EVERY_S", 0.0)
     result = lab.run("ledger", "--watch", "--json")
-    assert result.exit_code == 0
+    assert result.exit_code == 1
+    line = "psiu: the books of base (those of the links and those of the robots do not agree) do not balance: "
+    assert result.stderr == f"{line}please report it\n" * 3, "at each look, and at the end"
     assert [json.loads(line)[0]["balances"] for line in result.stdout.splitlines()] == [False, False]
+
+
+def off_by_one(told: Any, what: str) -> Any:
+    account = told["accounts"][0]
+    return told | {"accounts": [account | {what: account[what] + 1}, *told["accounts"][1:]]}
+
+
+@pytest.mark.parametrize("what", ["arrived", "delivered", "answered", "waiting"])
+def test_the_sums_are_done_again_whatever_the_broker_says_of_them(
+    lab: Any, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    told = lab.json("ledger")[0]
+    assert told["balances"]
+    monkeypatch.setattr(Client, "ask", lambda *_: {"base": off_by_one(told, what)})
+    result = lab.run("ledger")
+    assert result.exit_code == 1
+    assert f"the books of base ({told['accounts'][0]['link']} " in result.stderr
+
+
+def test_a_robot_of_whom_more_was_dropped_than_came_fails_aloud(lab: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    account = {"robot": "MNERIM", "arrived": 1, "delivered": -1, "answered": 0, "dropped": {"expired": 2}}
+    monkeypatch.setattr(Client, "ask", lambda *_: {"base": [account]})
+    result = lab.run("ledger", "MNERIM")
+    assert result.exit_code == 1
+    assert "MNERIM 1 arrived, -1 delivered" in result.stderr

@@ -37,6 +37,8 @@ class Bus:
     def brokers(self) -> list[str]:
         return self.others
 
+    def refuse_where_denied(self) -> None: ...
+
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Bus:

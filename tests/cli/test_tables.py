@@ -65,7 +65,7 @@ def test_books_that_do_not_balance_fail_aloud(lab: Any, monkeypatch: pytest.Monk
     monkeypatch.setattr(Client, "ask", lambda *_: {"base": told})
     result = lab.run("ledger")
     assert result.exit_code == 1
-    assert "the books of base do not balance" in result.stderr
+    assert "the books of base (those of the links and those of the robots do not agree)" in result.stderr
 
 
 def test_the_status_is_one_object_a_broker_with_its_health(lab: Any) -> None:
