@@ -297,7 +297,9 @@ class Link(Kept):
         longest_s = options.question_max_age_s if urgency == QUESTION_LANE else options.max_age_s
         limit = None if self._limits is None else self._limits.of(frame.subject)
         key: Hashable = None
-        if options.newest_wins and urgency == COMMAND_LANE and not is_answer(frame):
+        if urgency == STOP_LANE:
+            key = peer, frame.destination, frame.payload
+        elif options.newest_wins and urgency == COMMAND_LANE and not is_answer(frame):
             word = frame.subject.lower()
             if any(fnmatchcase(word, pattern.lower()) for pattern in options.newest_wins):
                 key = peer, frame.destination, word

@@ -207,6 +207,32 @@ async def test_a_robot_that_is_stopped_is_not_moved_by_what_waited_before(hub: H
     assert hub.fates == ["superseded", "delivered", "delivered"]
 
 
+async def test_a_robot_that_is_stopped_is_not_moved_by_what_waited_for_everyone(hub: Hub) -> None:
+    transport = MemoryTransport()
+    link = connected(hub, transport)
+    transport.full = True
+    link.offer(psiu_ascii.message(PC, EVERYONE, "anda", "10"), None, ARRIVED, 0.0)
+    link.offer(psiu_ascii.message(PC, MNERIM, "pare"), None, ARRIVED, 0.0)
+    assert hub.fates == ["superseded"]
+    transport.full = False
+    link.writable()
+    assert [wire.split()[2] for wire in transport.wires] == [b"pare"]
+
+
+async def test_where_no_more_stops_fit_one_takes_the_place_of_its_equal(hub: Hub) -> None:
+    transport = MemoryTransport()
+    link = connected(hub, transport, queue_frames=2)
+    transport.full = True
+    for source, robot in (("PC", "MNERIM"), ("PC", "LAMP"), ("BETA", "MNERIM")):
+        link.offer(psiu_ascii.message(Address.named(source), Address.named(robot), "pare"), None, ARRIVED, 0.0)
+    assert hub.fates == ["superseded"]
+    assert link.offer(psiu_ascii.message(PC, MNERIM, "pare", "agora"), None, Way("cable"), 0.0) is None
+    assert hub.fates == ["superseded", "queue_full"]
+    transport.full = False
+    link.writable()
+    assert [(wire.split()[0], wire.split()[-2]) for wire in transport.wires] == [(b"LAMP", b"PC"), (b"MNERIM", b"PC")]
+
+
 async def test_what_waited_too_long_never_moves_a_robot(hub: Hub) -> None:
     transport = MemoryTransport()
     made = configuration(max_age_s=2.0)

@@ -37,21 +37,24 @@ class Line:
     def __init__(self, link: Link, hub: Hub, peer: Peer, hear: Callable[[], Any]) -> None:
         self.link, self.hub, self.peer, self._hear = link, hub, peer, hear
 
-    def offer(self, frame: Frame) -> str | None:
-        return self.link.offer(frame, self.peer, Way("wifi"), asyncio.get_running_loop().time())
+    def offer(self, frame: Frame, arrived: str = "wifi") -> str | None:
+        return self.link.offer(frame, self.peer, Way(arrived), asyncio.get_running_loop().time())
 
     async def heard(self, frames: int) -> list[str]:
         """The command words of so many frames, in the order in which they came."""
+        return [frame.subject for frame in await self.frames(frames)]
+
+    async def frames(self, count: int) -> list[Frame]:
         data = b""
         async with asyncio.timeout(PATIENCE_S):
-            while len(words := _words(data)) < frames:
+            while len(frames := _frames(data)) < count:
                 data += await self._hear()
-        return words
+        return frames
 
 
-def _words(data: bytes) -> list[str]:
+def _frames(data: bytes) -> list[Frame]:
     made = configuration()
-    return [event.subject for event in codec_of(made).decode(data, 0.0) if isinstance(event, Frame)]
+    return [event for event in codec_of(made).decode(data, 0.0) if isinstance(event, Frame)]
 
 
 def make(adapter: Adapter, hub: Hub, **options: object) -> Link:
@@ -131,6 +134,27 @@ async def test_a_stop_passes_all_that_waits_for_the_wire(line_of: Any, ahead: in
         words = await line.heard(QUEUED + 1)
     assert words.index("pare") == taken
     assert words.count("brilho") == QUEUED
+
+
+@pytest.mark.parametrize("line_of", [serial, rfcomm])
+async def test_no_other_way_s_stops_keep_a_stop_from_leaving_in_its_turn(line_of: Any, tmp_path: Path) -> None:
+    """Each with another name and other words, before it and after it, and more than fit."""
+    async with line_of(tmp_path) as line:
+        while line.offer(lamp(0)) == "delivered":
+            pass
+
+        def flood(first: int) -> None:
+            for number in range(first, first + 3 * QUEUED):
+                evil = Address.named(f"EVIL{number}")
+                line.offer(psiu_ascii.message(evil, Address.named("LAMP"), "pare", str(number)), "radio")
+
+        flood(0)
+        line.offer(psiu_ascii.message(PC, MNERIM, "pare"))
+        flood(1000)
+        line.offer(psiu_ascii.message(PC, Address.named("BETA"), "pare"), "cable")
+        flood(2000)
+        stops = [frame for frame in await line.frames(2 * QUEUED) if frame.subject == "pare"]
+    assert {str(frame.destination) for frame in stops[:4]} == {"LAMP", "MNERIM", "BETA"}
 
 
 async def test_a_stop_passes_datagrams_that_wait_for_the_network(

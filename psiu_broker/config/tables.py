@@ -233,7 +233,7 @@ class LinkOptions(_Table):
     allow: tuple[Glob, ...] | None = Field(None, description="who may command from here, where no [[policy]] decides")
     deny: tuple[Glob, ...] = Field((), description="who may not command from here, where no [[policy]] decides")
     new_names_per_minute: int = Field(
-        30, ge=1, le=100_000, description="robots heard here for the first time; more are not listened to"
+        30, ge=1, le=100_000, description="robots heard here for the first time; of more only stops are listened to"
     )
     plays: str | None = Field(None, description="the robot that programs at the far end find there, and command")
     proxy_errors: bool = Field(

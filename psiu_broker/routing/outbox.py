@@ -1,6 +1,10 @@
-"""What waits for one link: bounded, urgent first, and never late."""
+"""What waits for one link: bounded, urgent first, and never late.
 
-from collections import deque
+Stops leave by turns of the ways by which they came, and where no more fit, the way that has the most of them waiting
+gives one up: names can be made up, ways hardly.
+"""
+
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Hashable, Iterator
 from itertools import chain
 from typing import Final, NamedTuple
@@ -84,7 +88,7 @@ class Parcel(NamedTuple):
     limit: str | None = None
     """The limit that its subject shares, if any does."""
     key: Hashable = None
-    """Of a set-point: a newer one with the same key takes its place."""
+    """Of a set-point, and of a stop where no more fit: a newer one with the same key takes its place."""
 
 
 class Outbox:
@@ -107,15 +111,22 @@ class Outbox:
         return chain(*self._lanes)
 
     def put(self, parcel: Parcel) -> Parcel | None:
-        """Queue `parcel`; if there was no room, the one that had to go: the oldest of the least urgent lane."""
+        """Queue `parcel`; if there was no room, the one that had to go: the oldest of the least urgent lane.
+
+        Of a box full of stops, it is the oldest of the way that has the most, `parcel` included.
+        """
         evicted = None
         if self.size >= self._capacity:
             least = next(lane for lane in reversed(self._lanes) if lane)
             if least[0].lane < parcel.lane:
                 return parcel
-            evicted = least.popleft()
+            evicted = self._surplus_stop(parcel) if least[0].lane == STOP_LANE else least[0]
+            least.remove(evicted)
             self.size -= 1
-        self._lanes[parcel.lane].append(parcel)
+        if parcel.lane == STOP_LANE:
+            self._line_up(parcel)
+        else:
+            self._lanes[parcel.lane].append(parcel)
         self.size += 1
         return evicted
 
@@ -123,9 +134,11 @@ class Outbox:
         """Put `newer` where one with its key waits, and return that; None, and nothing changed, where none does.
 
         The newer one leaves when the older would have, so that a stream of set-points starves nobody and is not
-        starved by itself; its age is its own.
+        starved by itself; its age is its own. Stops are swapped only where no more fit: each has its own answer.
         """
         waiting = self._lanes[newer.lane]
+        if newer.lane == STOP_LANE and len(waiting) < self._capacity:
+            return None
         for place, older in enumerate(waiting):
             if older.key == newer.key:
                 waiting[place] = newer
@@ -133,13 +146,16 @@ class Outbox:
         return None
 
     def overtaken(self, stop: Parcel) -> list[Parcel]:
-        """Take out what waits for the robot that `stop` is for and would, behind it, move it again."""
+        """Take out all that waits and would, behind `stop`, move a robot again that it is for.
+
+        That goes for what is for everyone, too: it is better not to move some robots than to move one that was stopped.
+        """
         robot = stop.fate.frame.destination
         return self._take_out(
             lambda older: (
                 older.lane == COMMAND_LANE
                 and older.peer == stop.peer
-                and robot in (EVERYONE, older.fate.frame.destination)
+                and (robot == EVERYONE or older.fate.frame.destination in (robot, EVERYONE))
                 and not is_answer(older.fate.frame)
             )
         )
@@ -180,6 +196,24 @@ class Outbox:
     def clear(self) -> list[Parcel]:
         """Take out everything: the link went down, and nothing of it may move a robot later."""
         return self._take_out(lambda _: True)
+
+    def _line_up(self, stop: Parcel) -> None:
+        """Put `stop` before the second one of a way if it is its own way's first, and so on."""
+        waiting = self._lanes[STOP_LANE]
+        turn = sum(each.fate.arrived == stop.fate.arrived for each in waiting)
+        before: Counter[Way] = Counter()
+        for place, each in enumerate(waiting):
+            if before[each.fate.arrived] > turn:
+                waiting.insert(place, stop)
+                return
+            before[each.fate.arrived] += 1
+        waiting.append(stop)
+
+    def _surplus_stop(self, newcomer: Parcel) -> Parcel:
+        """The oldest of those that came by the way that has the most."""
+        waiting = self._lanes[STOP_LANE]
+        stops = Counter(each.fate.arrived for each in (*waiting, newcomer))
+        return max(waiting, key=lambda each: stops[each.fate.arrived])
 
     def _take_out(self, unwanted: Callable[[Parcel], bool]) -> list[Parcel]:
         taken: list[Parcel] = []

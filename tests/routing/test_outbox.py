@@ -1,4 +1,5 @@
 from collections.abc import Hashable
+from itertools import count
 
 import pytest
 from hypothesis import given
@@ -7,7 +8,7 @@ from hypothesis import strategies as st
 from psiu_broker.frame import Address, Frame, Way
 from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE, Fate, Outbox, Parcel, lane
 
-ARRIVED = Way("wifi")
+ARRIVED, CABLE, RADIO = Way("wifi"), Way("cable"), Way("radio")
 
 
 def frame(subject: str = "parafrente", robot: str = "MNERIM", words: str = "") -> Frame:
@@ -16,9 +17,18 @@ def frame(subject: str = "parafrente", robot: str = "MNERIM", words: str = "") -
 
 
 def parcel(
-    name: str, lane: int = COMMAND_LANE, expires: float = 10.0, peer: object = None, key: Hashable = None
+    name: str,
+    lane: int = COMMAND_LANE,
+    expires: float = 10.0,
+    peer: object = None,
+    key: Hashable = None,
+    way: Way = ARRIVED,
 ) -> Parcel:
-    return Parcel(name.encode(), peer, lane, 0.0, expires, Fate(frame(), ARRIVED), key=key)
+    return Parcel(name.encode(), peer, lane, 0.0, expires, Fate(frame(), way), key=key)
+
+
+def stop(name: str, way: Way = ARRIVED, key: Hashable = None) -> Parcel:
+    return parcel(name, STOP_LANE, way=way, key=key)
 
 
 def names(parcels: list[Parcel]) -> str:
@@ -58,12 +68,24 @@ def test_a_stop_takes_out_what_would_move_its_robot_again_and_no_answer() -> Non
     answer = Fate(frame("parafrente", "MNERIM", "sucesso"), ARRIVED)
     for fate in (*moves, answer):
         outbox.put(Parcel(b"", None, COMMAND_LANE, 0.0, 10.0, fate))
-    stop = Parcel(b"", None, STOP_LANE, 0.0, 10.0, Fate(frame("pare", "MNERIM"), ARRIVED))
-    assert [each.fate for each in outbox.overtaken(stop)] == [moves[0]]
-    everyone = stop._replace(fate=Fate(frame("pare", "??"), ARRIVED))
+    mnerim = Parcel(b"", None, STOP_LANE, 0.0, 10.0, Fate(frame("pare", "MNERIM"), ARRIVED))
+    assert [each.fate for each in outbox.overtaken(mnerim)] == [moves[0]]
+    everyone = mnerim._replace(fate=Fate(frame("pare", "??"), ARRIVED))
     assert outbox.overtaken(everyone._replace(peer="another")) == []
     assert [each.fate for each in outbox.overtaken(everyone)] == [moves[1]]
     assert [each.fate for each in outbox] == [answer]
+
+
+def test_a_stop_takes_out_what_would_move_everyone_with_its_robot_on_that_far_end() -> None:
+    outbox = Outbox()
+    moves = {peer: Fate(frame("parafrente", "??"), ARRIVED) for peer in ("hers", "his")}
+    question = Fate(frame("qualseunome", "??"), ARRIVED)
+    for peer, fate in moves.items():
+        outbox.put(Parcel(b"", peer, COMMAND_LANE, 0.0, 10.0, fate))
+    outbox.put(Parcel(b"", "hers", QUESTION_LANE, 0.0, 10.0, question))
+    hers = Parcel(b"", "hers", STOP_LANE, 0.0, 10.0, Fate(frame("pare", "MNERIM"), ARRIVED))
+    assert [each.fate for each in outbox.overtaken(hers)] == [moves["hers"]]
+    assert [each.fate for each in outbox] == [moves["his"], question]
 
 
 def test_a_newer_set_point_takes_the_place_of_the_older_and_has_its_own_age() -> None:
@@ -118,6 +140,78 @@ def test_a_full_box_of_urgent_frames_turns_a_question_away() -> None:
     assert taken(outbox) == "stop"
 
 
+def test_stops_leave_by_turns_of_the_ways_by_which_they_came() -> None:
+    outbox = Outbox()
+    for item in (
+        stop("e1"),
+        stop("e2"),
+        stop("e3"),
+        stop("c1", CABLE),
+        stop("e4"),
+        stop("r1", RADIO),
+        stop("c2", CABLE),
+    ):
+        outbox.put(item)
+    assert taken(outbox) == "e1 c1 r1 e2 c2 e3 e4"
+
+
+def test_of_a_box_full_of_stops_the_way_that_has_most_gives_up_its_oldest() -> None:
+    outbox = Outbox(4)
+    for name in ("e1", "e2", "e3"):
+        assert outbox.put(stop(name)) is None
+    for lone in (stop("c1", CABLE), stop("r1", RADIO)):
+        evicted = outbox.put(lone)
+    assert evicted is not None
+    assert evicted.wire == b"e1"
+    evicted = outbox.put(stop("e4"))
+    assert evicted is not None
+    assert evicted.wire == b"e2"
+    evicted = outbox.put(stop("c2", CABLE))
+    assert evicted is not None
+    assert evicted.wire == b"c1", "counted together with the newcomer, and the first in line of those"
+    assert taken(outbox) == "r1 e3 c2 e4"
+
+
+def test_where_no_more_stops_fit_an_equal_one_takes_the_place_of_the_older() -> None:
+    outbox = Outbox(2)
+    outbox.put(stop("a1", key="a"))
+    again = stop("a2", key="a")
+    assert outbox.swap(again) is None, "there is room for both, and each is answered"
+    outbox.put(again)
+    older = outbox.swap(stop("a3", CABLE, key="a"))
+    assert older is not None
+    assert older.wire == b"a1"
+    assert outbox.swap(stop("b", key="b")) is None
+    assert taken(outbox) == "a3 a2"
+
+
+@given(
+    st.lists(st.sampled_from([ARRIVED, ARRIVED, RADIO, Way("udp", 1), Way("udp", 2), None]), max_size=60),
+    st.lists(st.sampled_from([ARRIVED, ARRIVED, RADIO, Way("udp", 1), Way("udp", 2), None]), max_size=60),
+    st.integers(5, 9),
+)
+def test_however_many_stops_other_ways_bring_a_lone_one_leaves_in_its_turn(
+    before: list[Way | None], after: list[Way | None], capacity: int
+) -> None:
+    """None: one stop leaves. There is room for as many as there are ways."""
+    outbox, serial = Outbox(capacity), count()
+    lone = stop("lone", CABLE)
+    evicted: list[Parcel | None] = []
+    turns = 0
+    for way in before:
+        evicted.append(outbox.put(stop(str(next(serial)), way)) if way else outbox.take())
+    evicted.append(outbox.put(lone))
+    for way in (*after, *[None] * 5):
+        if way is not None:
+            evicted.append(outbox.put(stop(str(next(serial)), way)))
+        else:
+            turns += 1
+            if outbox.take() is lone:
+                break
+    assert turns <= 5, "one of each way, its own included"
+    assert not any(each is lone for each in evicted)
+
+
 def test_what_is_too_late_comes_out_instead_of_moving_a_robot() -> None:
     outbox = Outbox()
     outbox.put(parcel("late", expires=1.0))
@@ -157,6 +251,7 @@ def test_a_frame_that_went_two_ways_is_delivered_if_one_copy_was() -> None:
 steps = st.lists(
     st.one_of(
         st.tuples(st.just("put"), st.integers(0, 2), st.integers(0, 10), st.sampled_from([1, 2])),
+        st.tuples(st.just("equal"), st.integers(1, 3), st.integers(0, 10), st.sampled_from([1, 2])),
         st.tuples(st.just("set"), st.integers(1, 3), st.integers(0, 10), st.sampled_from([1, 2])),
         st.tuples(st.just("take"), st.just(0), st.just(0), st.sampled_from([0, 1])),
         st.tuples(st.just("return"), st.just(0), st.just(0), st.sampled_from([0, 1])),
@@ -172,7 +267,7 @@ steps = st.lists(
 def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
     steps: list[tuple[str, int, int, int]], capacity: int
 ) -> None:
-    """Each parcel comes out once; of a lane and a peer in order; none too late; of a set-point only the newest."""
+    """Each parcel comes out once; all but stops in order, by lane and peer; none too late; of set-points the newest."""
     outbox = Outbox(capacity)
     every: list[Parcel] = []
     out: list[int] = []
@@ -189,7 +284,8 @@ def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
             out.append(id(evicted))
 
     def set_to(item: Parcel) -> None:
-        newest[item.key] = item
+        if item.lane == COMMAND_LANE:
+            newest[item.key] = item
         older = outbox.swap(item)
         if older is None:
             put(item)
@@ -201,12 +297,13 @@ def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
     for action, number, at, peer in steps:
         if action == "put":
             put(parcel("x", number, at, peer))
-        elif action == "set":
-            set_to(parcel("x", COMMAND_LANE, at, peer, key=(number, peer)))
+        elif action in ("set", "equal"):
+            way = (ARRIVED, CABLE, RADIO)[number - 1]
+            set_to(parcel("x", COMMAND_LANE if action == "set" else STOP_LANE, at, peer, (number, peer), way))
         elif action == "stop":
-            stop = parcel("stop", STOP_LANE, at, peer)
-            out += map(id, outbox.overtaken(stop))
-            put(stop)
+            halt = parcel("stop", STOP_LANE, at, peer)
+            out += map(id, outbox.overtaken(halt))
+            put(halt)
             assert not any(each.lane == COMMAND_LANE and each.peer == peer for each in outbox)
         elif action in ("take", "return"):
             first = outbox.take({peer})
@@ -217,8 +314,9 @@ def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
                 if action == "return":
                     outbox.put_back(first)
                 else:
-                    assert gone_up_to.get((first.lane, first.peer), 0) < place[id(first)]
-                    gone_up_to[first.lane, first.peer] = place[id(first)]
+                    if first.lane != STOP_LANE:
+                        assert gone_up_to.get((first.lane, first.peer), 0) < place[id(first)]
+                        gone_up_to[first.lane, first.peer] = place[id(first)]
                     out.append(id(first))
         elif action == "expire":
             late = outbox.expire(at)
@@ -229,6 +327,6 @@ def test_whatever_happens_nothing_is_lost_late_or_out_of_order(
             out += map(id, outbox.remove_peer(peer))
             assert not any(each.peer == peer for each in outbox)
         assert outbox.size == len(list(outbox)) <= capacity
-        assert all(each is newest[each.key] for each in outbox if each.key is not None)
+        assert all(each is newest[each.key] for each in outbox if each.key is not None and each.lane != STOP_LANE)
     out += map(id, outbox.clear())
     assert sorted(out) == sorted(map(id, every))
