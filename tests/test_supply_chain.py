@@ -19,8 +19,12 @@ LOCK = ROOT / ".ci" / "lock.txt"
 SOURCES = [
     file for folder in ("psiu_broker", "adapters", "tests", ".ci", "deploy") for file in (ROOT / folder).rglob("*.py")
 ]
-RUNS_WORDS = {"eval", "exec", "__import__"}
-RUNS_BYTES = {"pickle", "cPickle", "dill", "marshal", "shelve", "jsonpickle", "yaml", "joblib"}
+RUNS_WORDS = {"eval", "exec", "compile", "__import__"}
+RUNS_BYTES = {
+    "pickle", "cPickle", "cloudpickle", "dill", "marshal", "shelve", "jsonpickle", "yaml", "ruamel", "joblib", "runpy",
+}  # fmt: skip
+RUNS_SHELLS = {"getoutput", "getstatusoutput", "create_subprocess_shell", "subprocess_shell"}
+OF_MODULES = {"os": {"system", "popen"}, "builtins": RUNS_WORDS}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -35,8 +39,15 @@ def dangers(source: str) -> Iterator[str]:
                 yield from (f"line {node.lineno}: {each}" for each in modules if each.partition(".")[0] in RUNS_BYTES)
             case ast.ImportFrom(module=str(module)) if module.partition(".")[0] in RUNS_BYTES:
                 yield f"line {node.lineno}: {module}"
-            case ast.keyword(arg="shell", value=ast.Constant(value=True)):
-                yield f"line {node.lineno}: shell=True"
+            case ast.ImportFrom(module=str(module), names=names):
+                told = RUNS_SHELLS | OF_MODULES.get(module, set())
+                yield from (f"line {node.lineno}: {each.name}" for each in names if each.name in told)
+            case ast.Attribute(attr=name) if name in RUNS_SHELLS:
+                yield f"line {node.lineno}: {name}"
+            case ast.Attribute(value=ast.Name(id=module), attr=name) if name in OF_MODULES.get(module, set()):
+                yield f"line {node.lineno}: {module}.{name}"
+            case ast.keyword(arg="shell", value=value) if not (isinstance(value, ast.Constant) and not value.value):
+                yield f"line {value.lineno}: shell="
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
@@ -53,10 +64,24 @@ def test_no_code_is_made_of_words_or_bytes(file: Path) -> None:
         "from yaml import load",
         "import os, marshal",
         "call('x', shell=True)",
+        "call('x', shell=wanted)",
+        "types.FunctionType(compile('1', '', 'exec'), {})",
+        "builtins.eval('1')",
+        "from builtins import exec as run",
+        "os.system('x')",
+        "from os import popen",
+        "subprocess.getoutput('x')",
+        "await asyncio.create_subprocess_shell('x')",
+        "import ruamel.yaml",
     ],
 )
 def test_what_makes_code_of_words_or_bytes_is_found(source: str) -> None:
     assert list(dangers(source))
+
+
+def test_nothing_else_is_taken_for_it() -> None:
+    harmless = "re.compile('x')\nplatform.system()\nrun(['x'], shell=False)\nfrom re import compile as made\n"
+    assert list(dangers(harmless)) == []
 
 
 def locked() -> dict[str, str]:
