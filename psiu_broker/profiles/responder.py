@@ -4,12 +4,13 @@ Two brokers, or a broker and a robot that takes any frame for a command, must ne
 answer is never answered, and what may be one that came too late only a few times, and then once in a while.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Final
 
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.frame import EVERYONE, Address, Frame
-from psiu_broker.messages import Answer, Command
+from psiu_broker.messages import Answer, Command, Value
 from psiu_broker.profiles.hexa import AVAILABLE, FREE, WTF
 from psiu_broker.profiles.psiu import COUNT, NAME, QUESTIONS, SHOW, Said, canonical, said, text
 from psiu_broker.profiles.rarely import Rarely
@@ -24,6 +25,9 @@ NAME_EVERY_S: Final = 30.0
 """In the long run, for one who asks us by our name; who asks everyone is always told."""
 REFUSE_EVERY_S: Final = 2.0
 """As long as a robot has to answer: its late value must not be met with a falha or WTF that it answers in turn."""
+
+
+_UNPRINTABLE: Final = re.compile(r"[^!-~]")
 
 
 class Responder:
@@ -108,17 +112,25 @@ def listing(frame: Frame, name: str, commands: Sequence[Command]) -> Frame | Non
 def outcome(frame: Frame, name: str, answer: Answer) -> Frame | None:
     """The answer of `name` to the ASCII command `frame`, from what a robot of another protocol answered to the call.
 
-    A field of no bytes is ``0x``; an answer that has no words is a refusal. None where the robot answers nothing:
-    the command alone would read as one to the sender, and what became of it nobody knows.
+    A field of no bytes is ``0x``; of a text each word is a value, and what is no printable ASCII in it is ``?``. A
+    number that has no words is a refusal. None where the robot answers nothing: the command alone would read as one to
+    the sender, and what became of it nobody knows.
     """
     if answer.status is None and not answer.values:
         return None
     status = [] if answer.status is None else [answer.status]
     try:
-        values = ["0x" if value == "" else text(value) for value in answer.values]
+        values = [word for value in answer.values for word in _words(value)]
     except ValueError:
         return refusal(frame, name)
     return _say(name, frame, said(frame).command, *status, *values)
+
+
+def _words(value: Value) -> Sequence[str]:
+    """`value` in words of PSIU ASCII, at least one; raises ValueError."""
+    if isinstance(value, str):
+        return [_UNPRINTABLE.sub("?", word) for word in value.split()] or ["0x"]
+    return [text(value)]
 
 
 def refusal(frame: Frame, name: str) -> Frame:

@@ -221,8 +221,20 @@ def test_a_call_made_for_an_ascii_robot_is_answered_in_its_words() -> None:
 def test_an_answer_with_an_empty_field_or_without_words_is_still_an_answer() -> None:
     frame = ask("complex 0xa1b2", Address.named("BRACO"))
     assert told(frame, "BRACO", Answer(values=["", "07"], elapsed_ms=1)) == b"complex 0x 07"
-    assert told(frame, "BRACO", Answer(values=["a b"], elapsed_ms=1)) == b"complex falha"
     assert told(frame, "BRACO", Answer(values=[float("inf")], elapsed_ms=1)) == b"complex falha"
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (["bom dia"], b"fala bom dia"),
+        (["StandardFirmata 2.ino", "2.5"], b"fala StandardFirmata 2.ino 2.5"),
+        (["ol\u00e1\tmundo\x07", 3], b"fala ol? mundo? 3"),
+        ([" "], b"fala 0x"),
+    ],
+)
+def test_a_text_is_told_word_by_word_and_is_no_refusal(values: list[str | int | float], said: bytes) -> None:
+    assert told(ask("fala", Address.named("PLACA")), "PLACA", Answer(values=values, elapsed_ms=1)) == said
 
 
 def test_of_a_robot_that_does_not_answer_nothing_is_said_that_would_read_as_a_command() -> None:
