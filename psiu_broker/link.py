@@ -292,7 +292,7 @@ class Link(Kept):
     # Inside.
 
     def _parcel(self, frame: Frame, wire: bytes, peer: Peer, now: float, patience_s: float, fate: Fate) -> Parcel:
-        urgency = STOP_LANE if self.watch is not None and self.watch.stops(frame) else lane(frame)
+        urgency = self._urgency(frame)
         options = self.configuration.options
         longest_s = options.question_max_age_s if urgency == QUESTION_LANE else options.max_age_s
         limit = None if self._limits is None else self._limits.of(frame.subject)
@@ -304,6 +304,10 @@ class Link(Kept):
             if any(fnmatchcase(word, pattern.lower()) for pattern in options.newest_wins):
                 key = peer, frame.destination, word
         return Parcel(wire, peer, urgency, now, now + min(longest_s, patience_s), fate, limit, key)
+
+    def _urgency(self, frame: Frame) -> int:
+        """The lane of `frame`, also where only who watches over its robot knows that it stops it."""
+        return STOP_LANE if self.watch is not None and self.watch.stops(frame) else lane(frame)
 
     def _is_next(self, parcel: Parcel, now: float) -> bool:
         """Whether `parcel` need not wait behind any other, nor for a limit; if for a limit, it will be looked at."""

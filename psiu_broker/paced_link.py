@@ -23,7 +23,7 @@ from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
 from psiu_broker.frame import EVERYONE, NOBODY, Frame, Way
 from psiu_broker.link import CallAt, Hub, Link, Timer, log
-from psiu_broker.routing.outbox import COMMAND_LANE, Fate, Parcel, lane
+from psiu_broker.routing.outbox import COMMAND_LANE, Fate, Parcel
 from psiu_broker.routing.set_points import SetPoints
 from psiu_broker.routing.verdicts import DELIVERED, LINK_DOWN, REFUSED, SUPERSEDED, Verdict
 
@@ -148,7 +148,8 @@ class PacedLink(Link):
         hold_s = self._rests[robot].hold_s
         expires = now + min(self.configuration.options.max_age_s, patience_s, hold_s)
         # A set-point is no question, whatever its word; there is room for a stop and one other.
-        parcel = Parcel(payload, peer, min(lane(frame), COMMAND_LANE), now, expires, fate or Fate(frame, arrived))
+        urgency = min(self._urgency(frame), COMMAND_LANE)
+        parcel = Parcel(payload, peer, urgency, now, expires, fate or Fate(frame, arrived))
         superseded = self.outbox.replace(parcel)
         if parcel.lane < COMMAND_LANE:
             self._held.pop(robot, None)  # whatever becomes of the stop, the robot does not go on

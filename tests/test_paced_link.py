@@ -137,6 +137,21 @@ def pare(robot: Address) -> Frame:
     return set_point(robot, 0, 0, "pare")
 
 
+def rest(robot: Address) -> Frame:
+    """What stops a robot by the word of those who watch over it alone."""
+    return set_point(robot, 0, 0, "repouso")
+
+
+class Watch:
+    def stops(self, frame: Frame) -> bool:
+        return frame.subject == "repouso"
+
+    def left(self, link: str, frame: Frame, now: float) -> None: ...
+
+
+STOPS = pytest.mark.parametrize("stop", [pare, rest])
+
+
 def configuration(adapter: Adapter | None = None, max_age_s: float = 2.0, **codec: Any) -> LinkConfiguration:
     options = Soccer.Options(**{"rate_hz": 1 / PERIOD_S, **codec})
     return LinkConfiguration(
@@ -162,6 +177,7 @@ class Lab:
             clock=self.clock,
             call_at=self.clock.call_at,
         )
+        self.link.watch = Watch()
 
     def open(self) -> "Lab":
         self.link.connected(self.transport)
@@ -353,11 +369,12 @@ def test_neither_the_link_s_age_limit_nor_the_robot_s_is_outlived_in_waiting(max
     assert (lab.hub.verdicts, lab.packets) == (["expired"], [STOPPED] * 2)
 
 
-def test_whoever_sends_without_pause_does_not_undo_a_stop() -> None:
+@STOPS
+def test_whoever_sends_without_pause_does_not_undo_a_stop(stop: Callable[[Address], Frame]) -> None:
     lab = Lab().open()
     lab.clock.slots()
     lab.offer(set_point(ONE, 1, 1))
-    lab.offer(pare(ONE))
+    lab.offer(stop(ONE))
     assert lab.hub.fates == [(1, "superseded")]
     lab.offer(set_point(ONE, 2, 2))
     lab.offer(set_point(ONE, 15, 15))
@@ -366,24 +383,26 @@ def test_whoever_sends_without_pause_does_not_undo_a_stop() -> None:
     assert lab.hub.verdicts == ["superseded", "superseded", "delivered", "delivered"]
 
 
-def test_a_stop_that_found_no_room_in_time_stops_its_robot_all_the_same() -> None:
+@STOPS
+def test_a_stop_that_found_no_room_in_time_stops_its_robot_all_the_same(stop: Callable[[Address], Frame]) -> None:
     lab = Lab(hold_s=60.0).open()
     lab.offer(set_point(ONE, 15, 15))
     lab.clock.slots()
     lab.transport.full = True
-    lab.offer(pare(ONE), patience_s=0.05)
+    lab.offer(stop(ONE), patience_s=0.05)
     lab.clock.slots(5)
     lab.transport.full = False
     lab.clock.slots()
     assert (lab.hub.verdicts, lab.packets[-1]) == (["delivered", "expired"], STOPPED)
 
 
-def test_a_newer_stop_takes_the_place_of_all_that_waits_for_its_robot_alone() -> None:
+@STOPS
+def test_a_newer_stop_takes_the_place_of_all_that_waits_for_its_robot_alone(stop: Callable[[Address], Frame]) -> None:
     lab = Lab().open()
-    lab.offer(pare(ONE))
+    lab.offer(stop(ONE))
     lab.offer(set_point(ONE, 1, 1))
     lab.offer(set_point(TWO, 15, 15))
-    lab.offer(pare(ONE))
+    lab.offer(stop(ONE))
     lab.clock.slots()
     assert sorted(lab.hub.fates) == [(1, "delivered"), (1, "superseded"), (1, "superseded"), (2, "delivered")]
     assert lab.packets == ["aa03033e3e030355"]
