@@ -1,6 +1,8 @@
 """What all tests need of this process."""
 
+import os
 import signal
+import sys
 
 from hypothesis import HealthCheck, settings
 
@@ -11,3 +13,7 @@ settings.load_profile("any machine")
 # A shell that runs us in the background has us ignore Ctrl-C, and our children would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# A hundred tests start processes, each of which would compile all it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
