@@ -4,9 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
 
+import psutil
 import pytest
+from ports import free_port
 from secure_keys import make_keys
 
+from psiu_broker.broker import Broker
 from psiu_broker.config import Configuration, json_schema, load
 from psiu_broker.config.shown import shown
 from psiu_broker.errors import ConfigurationError
@@ -46,6 +49,26 @@ def problems(read: Read, folder: Path) -> Callable[[str], list[str]]:
         return [line.removeprefix(f"{folder}/base.toml: ") for line in caught.value.problems]
 
     return problems
+
+
+def open_sockets() -> set[tuple[str, int]]:
+    """Where this process may be spoken to: what listens, and datagrams."""
+    found = psutil.Process().net_connections("inet")
+    return {(each.laddr.ip, each.laddr.port) for each in found if each.status in ("LISTEN", "NONE") and each.laddr}
+
+
+async def test_a_broker_configured_as_usual_is_on_loopback_and_looks_for_nobody(tmp_path: Path) -> None:
+    file, port = tmp_path / "base.toml", free_port()
+    file.write_text(f'{BROKER}[zenoh]\nlisten = ["tcp/127.0.0.1:{port}"]\n')
+    before = open_sockets()
+    broker = Broker(load(file))
+    await broker.start()
+    try:
+        assert open_sockets() - before == {("127.0.0.1", port)}
+    finally:
+        await broker.stop()
+    file.write_text(BROKER)
+    assert load(file).zenoh.listen == ("tcp/127.0.0.1:7447",)
 
 
 def listen(*endpoints: str, more: str = "") -> str:
