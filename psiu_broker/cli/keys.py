@@ -1,5 +1,6 @@
 """`psiu-broker keys`: keys and certificates for a laboratory's brokers and programs."""
 
+import json
 import re
 from importlib import import_module
 from pathlib import Path
@@ -66,14 +67,14 @@ def _told(folder: Path, brokers: tuple[str, ...], programs: tuple[str, ...], day
     for broker in brokers[:1]:
         made += [
             "",
-            f"In the configuration of {broker}, as one of its brokers, commanders and listeners:",
+            f"In the configuration of {broker}; who may only listen goes from commanders to listeners:",
             "",
             "[zenoh]",
             'listen = ["tls/0.0.0.0:7447"]',
             "[zenoh.tls]",
-            f'ca = "{folder}/ca.pem"',
-            f'certificate = "{folder}/{broker}.pem"',
-            f'key = "{folder}/{broker}.key"',
+            f"ca = {_quoted(f'{folder}/ca.pem')}",
+            f"certificate = {_quoted(f'{folder}/{broker}.pem')}",
+            f"key = {_quoted(f'{folder}/{broker}.key')}",
             "[zenoh.access]",
             f"brokers = [{', '.join(map(_quoted, brokers))}]",
             f"commanders = [{', '.join(map(_quoted, programs))}]",
@@ -82,5 +83,6 @@ def _told(folder: Path, brokers: tuple[str, ...], programs: tuple[str, ...], day
     return "\n".join(made)
 
 
-def _quoted(name: str) -> str:
-    return f'"{name}"'
+def _quoted(text: str) -> str:
+    """`text` in TOML."""
+    return json.dumps(text, ensure_ascii=False)

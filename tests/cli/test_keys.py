@@ -68,9 +68,13 @@ def test_everybody_gets_a_key_that_only_its_owner_reads(daemon: Run, tmp_path: P
     assert problem(files(folder, "operator"), serves=False) is None
 
 
-def test_what_it_prints_is_a_configuration(daemon: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("folder", ["keys", 'the "best" keys\\ção 🤖'])
+def test_what_it_prints_is_a_configuration(
+    daemon: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
     monkeypatch.chdir(tmp_path)
-    result = daemon("keys", "keys", "--broker", "base", "--broker", "hill", "--program", "operator")
+    result = daemon("keys", folder, "--broker", "base", "--broker", "hill", "--program", "operator")
+    assert "who may only listen goes from commanders to listeners" in result.output
     file = tmp_path / "base.toml"
     file.write_text('[broker]\nname = "base"\n[zenoh]' + result.output.partition("[zenoh]")[2])
     configuration = load(file)
