@@ -194,6 +194,12 @@ def _default(field: Any) -> object:
 
 
 @READMES
+def test_every_extra_that_users_may_want_is_told(readme: str) -> None:
+    extras = tomllib.loads((TREE / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(extras) - {"test", "lint", "fuzz", "audit"} <= set(code(readme))
+
+
+@READMES
 def test_every_adapter_and_protocol_is_told(readme: str) -> None:
     ours = {name for name in adapter_names() if adapter_class(name).__module__.startswith("psiu_adapters.")}
     for name in ours:
