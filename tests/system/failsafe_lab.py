@@ -1,4 +1,7 @@
-"""A broker, a program that moves MNERIM, each in a process of its own, and MNERIM on a UDP socket here."""
+"""A broker, a program that moves MNERIM, each in a process of its own, and MNERIM on a UDP socket here.
+
+There may be another broker, `hill`, which has no robot: programs then connect to that one.
+"""
 
 import contextlib
 import select
@@ -11,6 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from psiu_broker.bus.client import Client
 from tests.ports import free_port
 
 PATIENCE_S = 20.0
@@ -32,31 +36,47 @@ link = "wifi"
 """
 
 
+HILL = """
+[broker]
+name = "hill"
+[zenoh]
+listen = ["tcp/127.0.0.1:{bus}"]
+[mesh]
+connect = ["tcp/127.0.0.1:{base}"]
+"""
+
+
 class Lab:
     """MNERIM, and what it has heard: each message, and when by the monotonic clock."""
 
-    def __init__(self, folder: Path, more: str) -> None:
+    def __init__(self, folder: Path, more: str, *, hill: bool = False) -> None:
         self.heard: list[tuple[float, str]] = []
         self.answers = True
+        self.spoke_at = 0.0
+        """When it answered last."""
         self.robot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.robot.bind(("127.0.0.1", 0))
-        self.bus = free_port()
-        self.file = folder / "base.toml"
-        wifi = free_port(socket.SOCK_DGRAM)
-        robot = self.robot.getsockname()[1]
-        self.file.write_text(CONFIGURATION.format(bus=self.bus, wifi=wifi, robot=robot, more=more))
-        self.broker = self._started(Path(sys.executable).parent / "psiu-broker", "run", "--config", self.file)
-        self._await(self.broker, self.broker.stderr, "is ready")
-        self._programs: list[subprocess.Popen[str]] = []
+        self._processes: list[subprocess.Popen[str]] = []
+        try:
+            self._open(folder, more, hill=hill)
+        except BaseException:
+            self.close()
+            raise
 
-    def program(self, *how: str) -> subprocess.Popen[str]:
-        """A program that has moved MNERIM."""
-        endpoint = f"tcp/127.0.0.1:{self.bus}"
+    def program(self, *how: str, wire: int = 0) -> subprocess.Popen[str]:
+        """A program that has moved MNERIM, connected by `wire` where there is one."""
+        endpoint = f"tcp/127.0.0.1:{wire or self.bus}"
         program = self._started(sys.executable, "-m", "tests.system.mover", endpoint, *how)
-        self._programs.append(program)
         self.until("parafrente")
         self._await(program, program.stdout, "moved")
         return program
+
+    def wire(self) -> tuple[int, subprocess.Popen[str]]:
+        """A wire to the broker of programs: the port at their end, and the process that is the wire."""
+        port = free_port()
+        wire = self._started(sys.executable, "-m", "tests.system.wire", str(port), str(self.bus))
+        self._await(wire, wire.stdout, "laid")
+        return port, wire
 
     def until(self, word: str, timeout_s: float = PATIENCE_S) -> float:
         """Be MNERIM until it is told `word`; when that was."""
@@ -79,7 +99,7 @@ class Lab:
         return [word for _, word in self.heard if word != "qualseunome"]
 
     def close(self) -> None:
-        for process in (*self._programs, self.broker):
+        for process in reversed(self._processes):
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(signal.SIGCONT)
                 process.kill()
@@ -97,14 +117,44 @@ class Lab:
             text = "base 000 qualseunome MNERIM " if word == "qualseunome" else f"base 000 {word} sucesso MNERIM "
             text = text.replace("000", f"{len(text) + 5:03d}")
             self.robot.sendto(f"{text}{sum(text.encode()) % 65536:05d}".encode(), sender)
+            self.spoke_at = time.monotonic()
         return word
 
-    @staticmethod
-    def _started(*command: str | Path) -> "subprocess.Popen[str]":
+    def _open(self, folder: Path, more: str, *, hill: bool) -> None:
+        self.bus = free_port()
+        wifi = free_port(socket.SOCK_DGRAM)
+        robot = self.robot.getsockname()[1]
+        base = CONFIGURATION.format(bus=self.bus, wifi=wifi, robot=robot, more=more)
+        self.broker = self._broker(folder / "base.toml", base)
+        if hill:
+            self.bus, port = free_port(), self.bus
+            self.hill = self._broker(folder / "hill.toml", HILL.format(bus=self.bus, base=port))
+            self._meet()
+
+    def _meet(self) -> None:
+        """Be MNERIM until `hill` knows whose it is."""
+        end = time.monotonic() + PATIENCE_S
+        with Client([f"tcp/127.0.0.1:{self.bus}"]) as client:
+            while time.monotonic() < end:
+                self.listen(0.05)
+                seen = client.ask("mesh", broker="hill").get("hill", {"robots": []})
+                if any((each["robot"], each["owner"]) == ("MNERIM", "base") for each in seen["robots"]):
+                    return
+        raise AssertionError("hill does not know that MNERIM is with base")
+
+    def _broker(self, file: Path, text: str) -> "subprocess.Popen[str]":
+        file.write_text(text)
+        broker = self._started(Path(sys.executable).parent / "psiu-broker", "run", "--config", file)
+        self._await(broker, broker.stderr, "is ready")
+        return broker
+
+    def _started(self, *command: str | Path) -> "subprocess.Popen[str]":
         pipe = subprocess.PIPE
-        return subprocess.Popen(
+        started = subprocess.Popen(
             [str(each) for each in command], stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT
         )
+        self._processes.append(started)
+        return started
 
     @staticmethod
     def _await(process: "subprocess.Popen[str]", stream: object, text: str) -> None:
@@ -115,9 +165,9 @@ class Lab:
 
 
 @contextlib.contextmanager
-def lab(more: str) -> Iterator[Lab]:
+def lab(more: str, *, hill: bool = False) -> Iterator[Lab]:
     with tempfile.TemporaryDirectory(prefix="psiu-failsafe-") as folder:
-        made = Lab(Path(folder), more)
+        made = Lab(Path(folder), more, hill=hill)
         try:
             yield made
         finally:

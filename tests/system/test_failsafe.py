@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from psiu_broker.bus.session import LEASE_S
 from tests.system.failsafe_lab import lab
 
 FAILSAFE = '[robots.MNERIM.failsafe]\ncommand = "pare"\n'
@@ -22,12 +23,35 @@ def test_a_program_that_is_killed_is_missed_at_once(how: str) -> None:
         assert here.listen(1.5) == [], "a stop that was answered is not repeated"
 
 
-@pytest.mark.parametrize(("how", "within_s"), [("call", 15), ("client", 6)], ids=["Zenoh's own", "our client's"])
-def test_a_program_that_hangs_is_missed_within_its_lease(how: str, within_s: float) -> None:
+def test_a_program_that_hangs_is_missed_within_its_lease() -> None:
     with lab(FAILSAFE) as here:
-        program = here.program(how)
+        program = here.program("client")
         program.send_signal(signal.SIGSTOP)
-        here.until("pare", within_s)
+        here.until("pare", LEASE_S + SOON_S)
+
+
+def test_a_program_that_is_cut_off_is_missed_within_its_lease() -> None:
+    with lab(FAILSAFE) as here:
+        port, wire = here.wire()
+        here.program("client", wire=port)
+        wire.send_signal(signal.SIGSTOP)
+        here.until("pare", LEASE_S + SOON_S)
+
+
+def test_the_broker_of_the_robot_misses_a_program_of_another_broker() -> None:
+    with lab(FAILSAFE, hill=True) as here:
+        program = here.program("client")
+        begun = time.monotonic()
+        program.send_signal(signal.SIGKILL)
+        assert here.until("pare") - begun < SOON_S
+
+
+def test_a_program_whose_broker_is_killed_is_missed_by_the_broker_of_the_robot() -> None:
+    with lab(FAILSAFE, hill=True) as here:
+        here.program("client")
+        begun = time.monotonic()
+        here.hill.send_signal(signal.SIGKILL)
+        assert here.until("pare") - begun < SOON_S
 
 
 def test_a_robot_that_does_not_answer_its_stop_is_told_only_so_often() -> None:
