@@ -258,13 +258,17 @@ class Calling:
         self._ungreeted.discard(route.robot)
 
     def undelivered(self, frame: Frame, verdict: Verdict) -> None:
+        self._note_unsent(frame)
         self.conversations.undelivered(frame, self._dropped(frame.destination, verdict))
 
     # conversation.Links
 
     def send(self, frame: Frame, patience_s: float) -> CallError | None:
         verdict = self._exchange.send(frame, self._clock(), patience_s)
-        return None if verdict is None or verdict == DELIVERED else self._dropped(frame.destination, verdict)
+        if verdict is None or verdict == DELIVERED:
+            return None
+        self._note_unsent(frame)
+        return self._dropped(frame.destination, verdict)
 
     def expire(self, link: str) -> None:
         self._exchange.links[link].expire(self._clock() + _MOMENT_S)
@@ -290,7 +294,7 @@ class Calling:
             return  # which says why better
         if request.question:
             return
-        words = {command, request.subject, *policy.words(robot.build(request))}
+        words = {command, request.subject, *policy.words(_frame(robot.own, robot.address, request, route.protocol))}
         for each in robot.profile.commands():
             names = {each.name, *each.aliases}
             if not names.isdisjoint(words):
@@ -304,6 +308,11 @@ class Calling:
         """How long `command`, asked for then, may still wait before it is too late for the robot."""
         link = self._exchange.links.get(route.way.link)
         return inf if link is None else link.configuration.options.longest_wait_s(command) - (self._clock() - asked_at)
+
+    def _note_unsent(self, frame: Frame) -> None:
+        profile = self._profile_of(frame.destination)
+        if profile is not None:
+            profile.unsent(frame)
 
     def _dropped(self, robot: Address, verdict: Verdict) -> CallError:
         code, text = _DROPPED.get(verdict, ("refused", verdict))
@@ -322,10 +331,7 @@ class Calling:
         ward = self.failsafe.ward(route.robot)
 
         def build(request: Request) -> Frame:
-            if route.protocol == psiu_ascii.PROTOCOL:
-                frame = psiu_ascii.message(own, address, *request.payload.decode("ascii").split(" "))
-            else:
-                frame = Frame(own, address, request.subject, request.payload, route.protocol)
+            frame = _frame(own, address, profile.sending(request), route.protocol)
             if ward is not None:
                 self.failsafe.offered(ward, frame, request, program)
             return frame
@@ -480,6 +486,12 @@ def _listing(command: str, parameters: Sequence[Any], route: Route, commands: Se
             return Answer(values=[shown.name, shown.ints, shown.floats, shown.chars], elapsed_ms=0.0)
         case _:
             return None
+
+
+def _frame(own: Address, robot: Address, request: Request, protocol: str) -> Frame:
+    if protocol == psiu_ascii.PROTOCOL:
+        return psiu_ascii.message(own, robot, *request.payload.decode("ascii").split(" "))
+    return Frame(own, robot, request.subject, request.payload, protocol)
 
 
 def _elsewhere(route: Route) -> CallError:

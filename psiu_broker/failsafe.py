@@ -123,13 +123,13 @@ class Failsafe:
     def stops(self, frame: Frame) -> bool:
         """Whether `frame` is what stops its robot, though its word may be that of any command."""
         ward = self._wards.get(frame.destination)
-        return ward is not None and self._is_stop(ward, frame)
+        return ward is not None and self._is_stop(ward, frame, self._offered.get(id(frame), (frame, frame))[1])
 
     def left(self, link: str, frame: Frame, now: float) -> None:
         """`frame` has left on a link."""
         _, request, program = self._offered.pop(id(frame), (frame, None, None))
         for ward in self._told(link, frame.destination):
-            if self._is_stop(ward, frame):
+            if self._is_stop(ward, frame, request or frame):
                 if frame.destination == EVERYONE:
                     continue  # robots take no heed of it
                 if ward.due:
@@ -225,8 +225,8 @@ class Failsafe:
         ward = self._wards.get(destination)
         return () if ward is None else (ward,)
 
-    def _is_stop(self, ward: Ward, frame: Frame) -> bool:
-        return lane(frame) == STOP_LANE or (frame.subject, frame.payload) == self._asked_of(ward)
+    def _is_stop(self, ward: Ward, frame: Frame, asked: Request | Frame) -> bool:
+        return lane(frame) == STOP_LANE or (asked.subject, asked.payload) == self._asked_of(ward)
 
     def _asked_of(self, ward: Ward) -> tuple[str, bytes]:
         profile = self._profile(ward.robot)

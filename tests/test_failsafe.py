@@ -365,6 +365,19 @@ async def test_what_other_robots_command_counts_when_the_broker_stops(text: str,
     assert lab.stops == stopped
 
 
+async def test_what_stops_the_robot_is_a_stop_in_whatever_words_it_is_sent() -> None:
+    """As to a board that knows no single pins, which is told of a whole port at once."""
+    lab = Lab(command="desliga")
+    lab.moves("p")
+    ward, request = lab.failsafe.ward(MNERIM), PROFILE.request("desliga", [])
+    frame = lab.frame("porta 16")
+    assert ward is not None
+    lab.failsafe.offered(ward, frame, request, "p")
+    assert lab.failsafe.stops(frame)
+    lab.failsafe.left("radio", frame, lab.now)
+    assert not ward.moves
+
+
 async def test_what_stops_the_robot_is_a_stop_whatever_its_word() -> None:
     lab = Lab(command="descansa")
     assert lab.failsafe.stops(lab.frame("descansa"))

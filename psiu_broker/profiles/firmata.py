@@ -7,7 +7,8 @@ turning its report on, upon which a board reports at once (Firmata 2.4); a pin's
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, model_validator
@@ -17,6 +18,7 @@ from psiu_broker.codecs.firmata_messages import (
     ASK_CAPABILITIES_MESSAGE,
     ASK_FIRMWARE_MESSAGE,
     ASK_MAPPING_MESSAGE,
+    ASK_VERSION_MESSAGE,
     MODES,
     RESET_MESSAGE,
     AnalogMapping,
@@ -62,6 +64,7 @@ TEXT_BYTES: Final = 30
 """What StandardFirmata has room for in a string."""
 
 _SINGLE_PINS_SINCE: Final = (2, 5)
+_SWITCHED_KEPT: Final = 64
 _MOST_PINS: Final = 128
 _LIKE_A_PIN: Final = re.compile(r"[AD][0-9]+")
 
@@ -104,9 +107,12 @@ class FirmataProfile(Profile):
         self._version: tuple[int, int] | None = None
         self._capabilities: Sequence[Mapping[int, int]] = ()
         self._channels: Sequence[int | None] = ()
-        self._masks: dict[int, int] = {}
-        """What the outputs of each port were set to, for boards that know no single pins."""
+        self._on: set[int] = set()
+        """The outputs that were switched on, for boards that know no single pins."""
+        self._switched: deque[tuple[bytes, Set[int], Set[int]]] = deque(maxlen=_SWITCHED_KEPT)
+        """What such a board was sent, the outputs that this changed, and those that were on before."""
         self._just_told_version = False
+        self._version_asked = False
         self._rest: Sequence[Request] | None = None
         """What the next greeting is limited to."""
 
@@ -156,13 +162,27 @@ class FirmataProfile(Profile):
             case AskPinState(number), DigitalMessage(_, mask):
                 return Reply(None, (mask >> number % 8 & 1,))
             case first, Firmware(major, minor, name):
-                if first != RESET_MESSAGE:
-                    return Reply(None, (name, f"{major}.{minor}"))
-                self._masks.clear()
-                return Reply("sucesso")
+                return Reply("sucesso") if first == RESET_MESSAGE else Reply(None, (name, f"{major}.{minor}"))
             case _, Capabilities() | AnalogMapping():
                 return Reply("sucesso")
         return None
+
+    def sending(self, request: Request) -> Request:
+        """A board before Firmata 2.5 knows no single pins: it is told the whole port, as it is by then."""
+        if self._version is None or self._version >= _SINGLE_PINS_SINCE:
+            return request
+        before = frozenset(self._on)
+        payload = b"".join(map(self._for_old_board, firmata.messages(request.payload, "host")))
+        self._switched.append((payload, before ^ self._on, before))
+        return request._replace(subject=firmata.message(payload).subject, payload=payload)
+
+    def unsent(self, frame: Frame) -> None:
+        for each in self._switched:
+            payload, changed, before = each
+            if payload is frame.payload:
+                self._on = (self._on - changed) | (before & changed)
+                self._switched.remove(each)
+                return
 
     def answers_to(self, request: Request) -> str:
         """The subject of the answer; nothing where there is none."""
@@ -190,12 +210,14 @@ class FirmataProfile(Profile):
         match read(frame.payload):
             case Version(major, minor):
                 self._version = (major, minor)
-                self._just_told_version = True
+                self._just_told_version, self._version_asked = not self._version_asked, False
             case Firmware() if after_version:
                 # Nobody asks for both at once: it has begun anew.
-                self._masks.clear()
+                self._on.clear()
                 self._rest = None
                 return True
+            case PinState(number, mode, state) if mode == MODES["output"]:
+                self._note(number, on=state == 1)
             case Capabilities(pins):
                 self._capabilities = pins[:_MOST_PINS]
             case AnalogMapping(channels):
@@ -267,12 +289,7 @@ class FirmataProfile(Profile):
     def _write(self, number: int, raw: int, *, digital: bool = False) -> Request:
         if not digital:
             return self._order(number, AnalogMessage(number, raw))
-        if self._version is None or self._version >= _SINGLE_PINS_SINCE:
-            return self._order(number, PinValue(number, raw == 1))
-        port, bit = divmod(number, 8)
-        mask = self._masks.get(port, 0) & ~(1 << bit) | raw << bit
-        self._masks[port] = mask
-        return self._order(number, DigitalMessage(port, mask))
+        return self._order(number, PinValue(number, raw == 1))
 
     def _order(self, number: int, order: Message) -> Request:
         if self._options.confirm:
@@ -314,9 +331,29 @@ class FirmataProfile(Profile):
         self._channels = channels
         news = [name for name, pin in self._pins.items() if self._found(pin) != before[name]]
         setting = self._setting(news)
-        if setting:
-            self._rest = (self._request(setting, silence=SENT),)
-        return bool(setting)
+        rest = [self._request(setting, silence=SENT)] if setting else []
+        if self._version is None:
+            # It did not begin anew when the link opened. Asked any sooner, it would seem to in its answers.
+            self._version_asked = True
+            rest.append(self._request([ASK_VERSION_MESSAGE], question=True))
+        self._rest = rest or None
+        return bool(rest)
+
+    def _for_old_board(self, wire: bytes) -> bytes:
+        """What is sent in the place of a message to a board that knows no single pins."""
+        match read(wire):
+            case PinValue(number, on):
+                self._note(number, on=on)
+                port = number // 8
+                return DigitalMessage(port, sum(1 << each % 8 for each in self._on if each // 8 == port)).wire
+            case PinMode(number, _):
+                self._note(number, on=False)
+            case message if message == RESET_MESSAGE:
+                self._on.clear()
+        return wire
+
+    def _note(self, number: int, *, on: bool) -> None:
+        (self._on.add if on else self._on.discard)(number)
 
     def _found(self, pin: Pin) -> tuple[int | None, int | None]:
         return self._number_of(pin.pin), self._channel_of(pin.pin) if pin.mode == "analog" else None
@@ -442,9 +479,6 @@ def _confirmed(order: Message | None, state: PinState) -> Reply:
             done, wanted = state.mode == mode, mode_name(mode)
         case PinValue(_, on):
             done, wanted = (state.mode, state.state) == (MODES["output"], on), f"output with {on:d}"
-        case DigitalMessage(_, mask):
-            bit = mask >> state.pin % 8 & 1
-            done, wanted = (state.mode, state.state) == (MODES["output"], bit), f"output with {bit}"
         case AnalogMessage(_, value):
             done = state.mode in (MODES["pwm"], MODES["servo"]) and state.state == value
             wanted = f"pwm or servo with {value}"

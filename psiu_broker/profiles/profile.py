@@ -151,6 +151,16 @@ class Profile(ABC):
         PSIU numbers no message, so that a late answer to one such request reads as the answer to the next.
         """
 
+    def sending(self, request: Request) -> Request:
+        """`request` as it is sent now; it may depend on what was sent before, of which `unsent` has not told.
+
+        Never raises.
+        """
+        return request
+
+    def unsent(self, frame: Frame) -> None:  # noqa: B027 - most have nothing to take back
+        """Take note that `frame`, made of what `sending` told, was dropped; never raises."""
+
     def moves(self, frame: Frame) -> bool:
         """Whether `frame`, sent to the robot, may set it in motion; never raises. Stops do not."""
         return not is_stop(frame.subject)

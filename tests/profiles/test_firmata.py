@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from psiu_broker.codecs import firmata_messages as fm
 from psiu_broker.codecs.codec import Directory
-from psiu_broker.codecs.firmata import Firmata
+from psiu_broker.codecs.firmata import Firmata, messages
 from psiu_broker.errors import CallError
 from psiu_broker.frame import NOBODY, Frame
 from psiu_broker.messages import Value
@@ -57,6 +57,7 @@ class Bench:
         return frames
 
     def send(self, request: Request) -> list[Frame]:
+        request = self.robot.sending(request)
         self.sent.append(request)
         frame = Frame(NOBODY, NOBODY, request.subject, request.payload, "firmata")
         told = b"".join(reply for _, reply in self.board.receive(self.codec.encode(frame), self.now))
@@ -327,17 +328,86 @@ def test_an_unknown_command_names_those_that_there_are() -> None:
 
 def test_boards_before_firmata_2_5_get_their_outputs_by_the_port_and_keep_the_others() -> None:
     robot = profile({"a": {"pin": 12, "mode": "output"}, "b": {"pin": 13, "mode": "output"}})
+
+    def sent(command: str, value: str) -> str:
+        return robot.sending(robot.request(command, [value])).payload.hex()
+
     robot.learn(frame("f90203"))
-    assert robot.request("a", ["on"]).payload.hex() == "911000f06d0cf7"
+    assert sent("a", "on") == "911000f06d0cf7"
+    assert sent("b", "on") == "913000f06d0df7"
     request = robot.request("b", ["on"])
-    assert request.payload.hex() == "913000f06d0df7"
     assert robot.read(request, frame("f06e0d0101f7")) == Reply("sucesso")
     assert robot.read(request, frame("f06e0d0100f7")) == Reply(
         "falha", remark="pin 13 is output with 0, not output with 1"
     )
-    assert robot.request("a", ["off"]).payload.hex() == "912000f06d0cf7"
+    assert robot.sending(robot.request("b", ["on"])).subject == "write-digital/1"
+    robot.learn(frame("f06e0d0101f7"))
+    assert sent("a", "off") == "912000f06d0cf7"
     assert robot.learn(frame("f90203")) or robot.learn(frame("f0790203f7"))
-    assert robot.request("a", ["off"]).payload.hex() == "910000f06d0cf7"
+    assert sent("a", "off") == "910000f06d0cf7"
+
+
+class OldBoard(FirmataBoard):
+    """Firmata 2.3, which the link does not reset when it opens; it knows no single pins."""
+
+    def hello(self) -> bytes:
+        return super().hello() and b""
+
+    def receive(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
+        kept = b"".join(wire for wire in messages(data, "host") if wire[0] != 0xF5)
+        return [
+            (delay_s, said.replace(b"\xf9\x02\x05", b"\xf9\x02\x03")) for delay_s, said in super().receive(kept, now)
+        ]
+
+
+OUTPUTS = {name: {"pin": pin, "mode": "output"} for name, pin in (("a", 10), ("b", 11), ("c", 12))}
+
+
+@pytest.mark.parametrize("confirm", [True, False])
+def test_a_board_that_did_not_begin_anew_is_asked_for_its_version_once_and_gets_its_outputs_by_the_port(
+    confirm: bool,
+) -> None:
+    at = Bench(profile(OUTPUTS, confirm=confirm), OldBoard())
+    at.greet()
+    done = Reply("sucesso") if confirm else SENT
+    assert at.call("a", "on") == at.call("b", "on") == at.call("a", "off") == done
+    assert [at.board.states[pin] for pin in (10, 11, 12)] == [0, 1, 0]
+    greetings = at.greetings
+    assert at.call("firmware") == Reply(None, ("StandardFirmata.ino", "2.5"))
+    assert at.greetings == greetings, "its answer was taken for a new beginning"
+    assert [each.subject for each in at.sent].count("ask/version") == 1
+
+
+def test_an_old_board_that_begins_anew_after_it_was_asked_is_greeted_again() -> None:
+    at = Bench(profile(OUTPUTS), OldBoard())
+    at.greet()
+    at.call("a", "on")
+    assert not at.robot.learn(frame("f90203"))
+    assert at.robot.learn(frame("f0790203f7"))
+    assert at.robot.sending(at.robot.request("b", [1])).payload.hex() == "910800f06d0bf7"
+
+
+@pytest.mark.parametrize("confirm", [True, False])
+def test_an_output_that_was_not_switched_after_all_is_not_switched_with_another(confirm: bool) -> None:
+    at = Bench(profile(OUTPUTS, confirm=confirm), OldBoard())
+    at.greet()
+    at.call("c", "on")
+    at.robot.request("a", ["on"])  # denied, or too late before its turn came
+    dropped = at.robot.sending(at.robot.request("b", ["on"]))
+    at.robot.unsent(Frame(NOBODY, NOBODY, dropped.subject, dropped.payload, "firmata"))
+    at.call("c", "off")
+    at.call("c", "on")
+    assert [at.board.states[pin] for pin in (10, 11, 12)] == [0, 0, 1]
+
+
+def test_pins_that_are_set_up_again_are_off_and_are_not_switched_on_with_another() -> None:
+    at = Bench(profile(OUTPUTS), OldBoard())
+    at.greet()
+    at.call("a", "on")
+    at.greet()
+    assert at.board.states[10] == 0
+    at.call("b", "on")
+    assert [at.board.states[pin] for pin in (10, 11, 12)] == [0, 1, 0]
 
 
 def test_answers_about_other_pins_are_not_taken() -> None:
