@@ -91,7 +91,7 @@ HILL = """
 VALLEY = """
     [trunks.valley]
     adapter = "serial"
-    device = "socket://10.0.0.7:4000"
+    device = "socket://127.0.0.1:4000"
 """
 ROBOT_WIFI = WIFI.replace("psiu-ascii", "psiu-hexa") + 'topology = "point-to-point"\nremote = 3\n'
 
@@ -184,7 +184,7 @@ def test_a_trunk_is_an_adapter_and_its_options(read):
 
 
 def test_a_raw_serial_line_is_no_trunk_and_the_author_learns_why_and_what_to_do(problems):
-    (line,) = problems(BROKER + VALLEY.replace("socket://10.0.0.7:4000", "/dev/ttyUSB0"))
+    (line,) = problems(BROKER + VALLEY.replace("socket://127.0.0.1:4000", "/dev/ttyUSB0"))
     assert line == (
         'trunks.valley.device: expected a stream that loses nothing, got "/dev/ttyUSB0":'
         " a raw serial line loses and corrupts bytes unnoticed;"
@@ -380,7 +380,7 @@ def test_a_robot_s_name_is_not_an_address(problems):
             id="a UDP port twice",
         ),
         pytest.param(
-            VALLEY.replace("socket://10.0.0.7:4000", "0403:6001"),
+            VALLEY.replace("socket://127.0.0.1:4000", "0403:6001"),
             'trunks.valley.device: expected a stream that loses nothing, got "0403:6001"',
             id="a trunk on a raw serial line",
         ),
@@ -391,7 +391,7 @@ def test_a_robot_s_name_is_not_an_address(problems):
         ),
         pytest.param(
             VALLEY.replace("trunks", "links") + 'protocol = "psiu-ascii"' + VALLEY,
-            'trunks.valley.device: "socket://10.0.0.7:4000" is taken by link valley already; give each its own',
+            'trunks.valley.device: "socket://127.0.0.1:4000" is taken by link valley already; give each its own',
             id="a trunk on the device of a link",
         ),
         pytest.param(

@@ -205,6 +205,25 @@ def test_a_trunk_is_told_to_be_a_way_round_the_rules(read: Read) -> None:
     assert read(TRUNK).warnings == ()
 
 
+@pytest.mark.parametrize("host", ["192.168.1.7", "hill.lan", "[fd00::7]", "[::1", "127.0.0.1.evil.net"])
+def test_a_trunk_over_the_network_needs_protection_as_any_other_way(
+    problems: Callable[[str], list[str]], read: Read, host: str
+) -> None:
+    trunk = f'[trunks.hill]\nadapter = "serial"\ndevice = "socket://{host}:4000"\n'
+    text = f"whoever answers at socket://{host}:4000, or is on the way there, may move the robots"
+    how = "go by a tunnel that ends on 127.0.0.1"
+    assert problems(trunk) == [f"trunks.hill.device: {text}; {how}, or say unprotected = true in [zenoh]"]
+    [warning] = read("[zenoh]\nunprotected = true\n" + trunk).warnings
+    assert warning.endswith(f"trunks.hill.device: {text}; {how}")
+    [warning] = read(listen("tls/127.0.0.1:7447") + TLS + ACCESS + trunk).warnings
+    assert "counts as a broker" in warning
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
+def test_a_trunk_on_this_computer_needs_none(read: Read, host: str) -> None:
+    assert read(f'[trunks.hill]\nadapter = "serial"\ndevice = "socket://{host}:4000"\n').warnings == ()
+
+
 def test_editors_know_the_tables() -> None:
     properties = json_schema()["properties"]["zenoh"]["properties"]
     assert {"tls", "access", "unprotected"} <= set(properties)

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from ipaddress import ip_address
 from typing import Final
+from urllib.parse import urlsplit
 
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.codecs import psiu_ascii
@@ -270,7 +271,9 @@ def _check_played(
         problems.add(key, text)
 
 
-def check_bus(zenoh: ZenohConfiguration, mesh: MeshConfiguration, problems: Problems) -> None:
+def check_bus(
+    zenoh: ZenohConfiguration, mesh: MeshConfiguration, trunks: Iterable[TrunkConfiguration], problems: Problems
+) -> None:
     """Nobody comes to the bus from another computer unseen, unless the user says so."""
     access, protected = zenoh.access, zenoh.tls is not None and zenoh.access is not None
     if access is not None and zenoh.tls is None:
@@ -291,6 +294,12 @@ def check_bus(zenoh: ZenohConfiguration, mesh: MeshConfiguration, problems: Prob
     if mesh.discover and not (protected or zenoh.unprotected):
         text = "whoever answers on the local network may move the robots"
         problems.add(("mesh", "discover"), f"{text}; {_PROTECT}")
+    for trunk in trunks:
+        device = getattr(trunk.adapter, "device", "")
+        if not (_is_near(device) or protected or zenoh.unprotected):
+            text = f"whoever answers at {device}, or is on the way there, may move the robots"
+            how = "go by a tunnel that ends on 127.0.0.1, or say unprotected = true in [zenoh]"
+            problems.add(("trunks", trunk.name, "device"), f"{text}; {how}")
 
 
 def _check_roles(access: AccessConfiguration, problems: Problems) -> None:
@@ -334,9 +343,13 @@ def warnings_about(
     if zenoh.tls is not None:
         for option, text in validity(zenoh.tls, now, serves=True):
             warnings.add(("zenoh", "tls", option), text)
-    for trunk in trunks if zenoh.access is not None else ():
-        text = "whoever is at its far end counts as a broker, and shows no certificate"
-        warnings.add(("trunks", trunk.name), f"{text}; see that nobody else reaches it")
+    for trunk in trunks:
+        if zenoh.access is not None:
+            text = "whoever is at its far end counts as a broker, and shows no certificate"
+            warnings.add(("trunks", trunk.name), f"{text}; see that nobody else reaches it")
+        elif not _is_near(device := getattr(trunk.adapter, "device", "")):
+            text = f"whoever answers at {device}, or is on the way there, may move the robots"
+            warnings.add(("trunks", trunk.name, "device"), f"{text}; go by a tunnel that ends on 127.0.0.1")
     for link in links:
         device = getattr(link.adapter, "device", None)
         if isinstance(device, str) and _NUMBERED_TTY.fullmatch(device):
@@ -347,12 +360,21 @@ def warnings_about(
     return tuple(warnings.lines)
 
 
+def _is_near(device: str) -> bool:
+    """Whether a serial port, by path or by URL, is reached without a network."""
+    try:
+        return "://" not in device or _is_own(urlsplit(device).hostname or "")
+    except ValueError:  # half an IPv6 address
+        return False
+
+
 def _is_loopback(endpoint: str) -> bool:
     match = ENDPOINT.fullmatch(endpoint)
-    host = match["host"] if match else None
-    if host is None or host == "localhost":
-        return True
+    return match is None or match["host"] is None or _is_own(match["host"].strip("[]"))
+
+
+def _is_own(host: str) -> bool:
     try:
-        return ip_address(host.strip("[]")).is_loopback
+        return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
         return False

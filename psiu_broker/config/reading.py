@@ -129,7 +129,7 @@ def _configuration(document: dict[str, Any], file: Path, problems: Problems) -> 
     check_identities(broker, whole_links.values(), whole_robots.values(), problems)
     if zenoh is not None and mesh is not None:
         zenoh = _with_files(zenoh, file.parent)
-        check_bus(zenoh, mesh, problems)
+        check_bus(zenoh, mesh, trunks.values(), problems)
         check_keys(zenoh, problems)
     if broker is None or zenoh is None or mesh is None or problems.lines:
         return None
