@@ -79,6 +79,13 @@ class PlayedPin(BaseModel):
             raise ValueError("ask needs poll_s: how often")
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
             raise ValueError("minimum is above maximum")
+        if self.command is not None and self.mode == "pwm":
+            try:
+                self.scaled(0)
+            except ValueError as error:
+                raise ValueError(
+                    f"a program switches a pwm pin off by 0, but {error}; widen minimum to maximum"
+                ) from None
         return self
 
     @property

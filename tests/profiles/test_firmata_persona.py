@@ -466,6 +466,11 @@ class TestMap:
             ({"A0": {"reading": "x", "above": 1}}, "A0: above has no meaning for such a pin"),
             ({"A0": {"reading": "x", "ask": "y"}}, "ask needs poll_s"),
             ({"9": {"command": "x", "mode": "pwm", "scale": 0}}, "a scale of 0"),
+            (
+                {"9": {"command": "x", "mode": "pwm", "minimum": 2}},
+                "a program switches a pwm pin off by 0, but x takes at least 2, got 0; widen minimum to maximum",
+            ),
+            ({"9": {"command": "x", "mode": "pwm", "offset": 9, "maximum": 8}}, "but x takes at most 8, got 9"),
             ({"9": {"command": "x", "mode": "pwm", "minimum": 2, "maximum": 1}}, "minimum is above maximum"),
             ({"9": {"command": "x", "mode": "pmw"}}, "'output', 'pwm' or 'servo'"),
         ],
