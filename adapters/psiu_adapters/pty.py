@@ -82,7 +82,8 @@ class Board(Transport):
 
     It comes with an empty piece, before anything that it says, and is `peer_lost` when it leaves. The next
     one finds another pseudo-terminal under the name: what the last one did not read, how it set the line
-    and that it locked it would stay with the old one.
+    and that it locked it would stay with the old one. Only a program that opens it before it was seen that
+    the last one left finds the old one as that left it: to set it right then could undo what this one set.
     """
 
     def __init__(self, terminal: Terminal, receiver: Receiver) -> None:
