@@ -5,7 +5,6 @@ There may be another broker, `hill`, which has no robot: programs then connect t
 
 import contextlib
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -56,7 +55,8 @@ class Lab:
         """When it answered last."""
         self.robot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.robot.bind(("127.0.0.1", 0))
-        self._processes: list[subprocess.Popen[str]] = []
+        self._brokers: list[subprocess.Popen[str]] = []
+        self._others: list[subprocess.Popen[str]] = []
         try:
             self._open(folder, more, hill=hill)
         except BaseException:
@@ -66,7 +66,7 @@ class Lab:
     def program(self, *how: str, wire: int = 0) -> subprocess.Popen[str]:
         """A program that has moved MNERIM, connected by `wire` where there is one."""
         endpoint = f"tcp/127.0.0.1:{wire or self.bus}"
-        program = self._started(sys.executable, "-m", "tests.system.mover", endpoint, *how)
+        program = self._started(self._others, sys.executable, "-m", "tests.system.mover", endpoint, *how)
         self.until("parafrente")
         self._await(program, program.stdout, "moved")
         return program
@@ -74,7 +74,7 @@ class Lab:
     def wire(self) -> tuple[int, subprocess.Popen[str]]:
         """A wire to the broker of programs: the port at their end, and the process that is the wire."""
         port = free_port()
-        wire = self._started(sys.executable, "-m", "tests.system.wire", str(port), str(self.bus))
+        wire = self._started(self._others, sys.executable, "-m", "tests.system.wire", str(port), str(self.bus))
         self._await(wire, wire.stdout, "laid")
         return port, wire
 
@@ -98,13 +98,22 @@ class Lab:
         """All that it was told, but for questions."""
         return [word for _, word in self.heard if word != "qualseunome"]
 
+    def leave(self) -> None:
+        """End programs and wires; the brokers stay."""
+        self._end(self._others)
+
     def close(self) -> None:
-        for process in reversed(self._processes):
+        self._end(self._others)
+        self._end(self._brokers)
+        self.robot.close()
+
+    @staticmethod
+    def _end(processes: "list[subprocess.Popen[str]]") -> None:
+        for process in processes:
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGCONT)
                 process.kill()
             process.communicate()
-        self.robot.close()
+        processes.clear()
 
     def _hear(self, timeout_s: float) -> str:
         if not select.select([self.robot], [], [], max(0.0, timeout_s))[0]:
@@ -144,16 +153,18 @@ class Lab:
 
     def _broker(self, file: Path, text: str) -> "subprocess.Popen[str]":
         file.write_text(text)
-        broker = self._started(Path(sys.executable).parent / "psiu-broker", "run", "--config", file)
+        command = Path(sys.executable).parent / "psiu-broker"
+        broker = self._started(self._brokers, command, "run", "--config", file)
         self._await(broker, broker.stderr, "is ready")
         return broker
 
-    def _started(self, *command: str | Path) -> "subprocess.Popen[str]":
+    @staticmethod
+    def _started(kept: "list[subprocess.Popen[str]]", *command: str | Path) -> "subprocess.Popen[str]":
         pipe = subprocess.PIPE
         started = subprocess.Popen(
             [str(each) for each in command], stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT
         )
-        self._processes.append(started)
+        kept.append(started)
         return started
 
     @staticmethod
