@@ -391,6 +391,7 @@ class Broker:
         while True:
             await self._bus_lost.wait()
             self.exchange.bus = NoBus()
+            self.programs.programs_unsure()  # nobody would tell of those that go until the bus is back
             lost, self._bus = self._bus, None
             try:
                 if lost is not None:

@@ -15,6 +15,7 @@ from ports import free_port
 from psiu_broker import broker as broker_module
 from psiu_broker import pulse
 from psiu_broker.broker import Broker
+from psiu_broker.bus.client import Client
 from psiu_broker.bus.round_trip import RoundTrip
 from psiu_broker.bus.session import Session
 from psiu_broker.config import load
@@ -66,9 +67,21 @@ class Lab:
     def heard(self) -> set[str]:
         return {card.robot for card in self.broker.cards().values() if card.last_heard is not None}
 
+    def mnerim_stopped(self) -> bool:
+        return any(heard.subject == "pare" for heard in self.mnerim.heard)
+
     async def call(self, robot: str, command: str, *parameters: int | float | str, timeout_s: float = 5.0) -> Answer:
         request = CallRequest(parameters=list(parameters), timeout_s=timeout_s)
         return await self.broker.call(Address.parse(robot), command, request)
+
+
+def watched(folder: Path) -> Lab:
+    """One where MNERIM is stopped when nobody is left who could."""
+    lab = Lab(folder)
+    with lab.file.open("a") as file:
+        file.write('[robots.MNERIM]\nlink = "radio"\nfailsafe = { command = "pare" }\n')
+    lab.broker = Broker(load(lab.file))
+    return lab
 
 
 @pytest.fixture
@@ -376,16 +389,26 @@ async def test_a_call_that_came_while_the_broker_stood_still_moves_nothing(lab: 
 async def test_programs_that_do_not_read_their_replies_do_not_hold_up_what_stops_robots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = Lab(tmp_path)
-    with made.file.open("a") as file:
-        file.write('[robots.MNERIM]\nlink = "radio"\nfailsafe = { command = "pare" }\n')
-    made.broker = Broker(load(made.file))
-    async with made as lab:
+    async with watched(tmp_path) as lab:
         await lab.call("MNERIM", "parafrente", 100)
         assert lab.broker._bus is not None
-        told = lambda: any(heard.subject == "pare" for heard in lab.mnerim.heard)  # noqa: E731
-        monkeypatch.setattr(lab.broker._bus, "retire", lambda: until(told))
+        monkeypatch.setattr(lab.broker._bus, "retire", lambda: until(lab.mnerim_stopped))
         await lab.broker.stop()
+
+
+async def test_robots_of_programs_are_stopped_where_the_bus_is_lost_and_does_not_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail() -> None:
+        raise BusError("the port is taken")
+
+    async with watched(tmp_path) as lab:
+        with Client(lab.broker.configuration.zenoh.listen) as program:
+            await asyncio.to_thread(program.call, "MNERIM", "parafrente", CallRequest(parameters=[100]))
+            assert lab.broker._bus is not None
+            monkeypatch.setattr(lab.broker, "_open_bus", fail)
+            lab.broker._bus.session.panicked(PanicException("in Rust"))
+            await until(lab.mnerim_stopped)
 
 
 async def test_a_broker_that_stops_opens_no_bus_again(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
