@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from secure_keys import files, make_keys
@@ -82,6 +82,30 @@ def test_a_file_that_is_no_certificate_is_refused(keys: Path, text: bytes) -> No
     (keys / "base.pem").write_bytes(text)
     found = problem(files(keys, "base"), serves=True)
     assert found == ("certificate", f"{keys}/base.pem: expected a certificate in PEM, -----BEGIN CERTIFICATE-----")
+
+
+def test_words_before_a_certificate_in_any_letters_do_no_harm(keys: Path) -> None:
+    for name in ("ca", "base"):
+        file = keys / f"{name}.pem"
+        file.write_bytes("Subject: CN=Laboratório\n".encode() + file.read_bytes())
+    assert problem(files(keys, "base"), serves=True) is None
+    assert read_certificate(f"{keys}/base.pem").name == "base"
+
+
+def test_a_key_that_is_too_weak_is_not_taken_for_another_s(tmp_path: Path) -> None:
+    key = rsa.generate_private_key(65537, 1024)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "base")])
+    certificate = x509.CertificateBuilder(name, name, key.public_key(), 1, NOW, NOW + timedelta(days=9)).sign(
+        key, hashes.SHA256()
+    )
+    for file in ("ca", "base"):
+        (tmp_path / f"{file}.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    (tmp_path / "base.key").touch(0o600)
+    (tmp_path / "base.key").write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    expected = ("certificate", f"{tmp_path}/base.pem cannot be used: EE_KEY_TOO_SMALL; make another")
+    assert problem(files(tmp_path, "base"), serves=True) in (expected, None), "an OpenSSL of low demands takes it"
 
 
 @pytest.mark.parametrize("owner", [0, 65534])

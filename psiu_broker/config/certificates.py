@@ -48,7 +48,7 @@ def read_certificate(path: str) -> Certificate:
         ValueError: there is none in it.
     """
     try:
-        _, begin, rest = Path(path).read_text("ascii").partition("-----BEGIN CERTIFICATE-----")
+        _, begin, rest = Path(path).read_text("latin-1").partition("-----BEGIN CERTIFICATE-----")
         body, end, _ = rest.partition("-----END CERTIFICATE-----")
         if not (begin and end):
             raise ValueError("it has no such lines")  # noqa: TRY301
@@ -124,7 +124,9 @@ def _mismatch(files: Files, *, serves: bool) -> tuple[str, str] | None:
     here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
         contexts = [_context(files, role) for role in (ssl.PROTOCOL_TLS_CLIENT, ssl.PROTOCOL_TLS_SERVER)]
-    except (ssl.SSLError, ValueError):
+    except (ssl.SSLError, ValueError) as error:
+        if "TOO_" in (reason := getattr(error, "reason", None) or ""):  # EE_KEY_TOO_SMALL, CA_MD_TOO_WEAK
+            return "certificate", f"{files.certificate} cannot be used: {reason}; make another"
         return "key", f"{files.key} is not the key of {files.certificate}, or has a password; give the one made with it"
     if not serves:
         contexts[0].verify_mode = ssl.CERT_NONE
