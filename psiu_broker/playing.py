@@ -9,7 +9,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 from psiu_broker.calling import Caller
 from psiu_broker.config import Configuration
@@ -35,6 +35,7 @@ SHORTEST_S: Final = 0.001
 STOPPED: Final = "a stop came meanwhile"
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class Robots(Protocol):
@@ -214,13 +215,8 @@ class Program:
 
     def _do(self, ask: Callable[[], Iterable[Say | Call]], now: float) -> bool:
         """Say what is to be said, begin what is to be done; False if something was refused for want of room."""
-        try:
-            actions = tuple(ask())
-            until = self._persona.waits_until()
-        except Exception:
-            self._mistakes += 1
-            if self._mistakes & (self._mistakes - 1) == 0:  # the 1st, 2nd, 4th, 8th, …
-                log.exception("what is played to %s as %s made a mistake", self._address, self.robot)
+        actions = self._try(lambda: tuple(ask()))
+        if actions is None:
             return False
         done = True
         for action in actions:
@@ -228,8 +224,19 @@ class Program:
                 self._send(Frame(self.robot, self._address, action.subject, action.payload, self._protocol))
             else:
                 done = self._take(_Asked(action, now)) and done
-        self._set_timer(until, now)
+        # Only now: what a stop swept away, the persona was told of meanwhile.
+        self._set_timer(self._try(self._persona.waits_until), now)
         return done
+
+    def _try(self, ask: Callable[[], T]) -> T | None:
+        """What the persona tells; None if it made a mistake."""
+        try:
+            return ask()
+        except Exception:
+            self._mistakes += 1
+            if self._mistakes & (self._mistakes - 1) == 0:  # the 1st, 2nd, 4th, 8th, …
+                log.exception("what is played to %s as %s made a mistake", self._address, self.robot)
+            return None
 
     def _take(self, asked: _Asked) -> bool:
         call = asked.call

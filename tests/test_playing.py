@@ -334,6 +334,37 @@ async def test_a_program_learns_of_what_a_stop_swept_away() -> None:
     await end(made)
 
 
+class Poller(Listener):
+    """Asks once a second, unless it waits for the answer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asks = False
+
+    def heard(self, frame: Frame, now: float) -> Sequence[Say | Call]:
+        self.asks = self.asks or frame.payload == b"sonar"
+        return super().heard(frame, now)
+
+    def answered(self, call: Call, answer: Answer | None, error: str, now: float) -> Sequence[Say]:
+        self.asks = False
+        return super().answered(call, answer, error, now)
+
+    def waits_until(self) -> float | None:
+        return None if self.asks else 1.0
+
+
+async def test_after_a_stop_that_swept_its_question_away_a_persona_has_its_turn_when_it_wants_it() -> None:
+    persona = Poller()
+    made = Program(persona, MNERIM, NOBODY, "mitya", Way("painel"), lambda frame: None, Silent(), lambda: 0.0)
+    hears(made, "sonar")
+    await asyncio.sleep(0)
+    assert made._timer is None
+    hears(made, "pare")
+    assert persona.answers[0][0] == "sonar"
+    assert made._timer is not None
+    await end(made)
+
+
 async def test_no_flood_of_stops_piles_up_and_none_is_lost() -> None:
     robots = Silent()
     made, _ = program(robots)
