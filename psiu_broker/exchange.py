@@ -19,7 +19,7 @@ from psiu_broker.messages import RawFrame
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.routing.allowance import Allowance
 from psiu_broker.routing.holding import Holding
-from psiu_broker.routing.outbox import Fate, is_question
+from psiu_broker.routing.outbox import STOP_LANE, Fate, is_question, lane
 from psiu_broker.routing.router import ANY, SELF, Decision, Port, Router
 from psiu_broker.routing.verdicts import (
     ANSWERED,
@@ -139,7 +139,7 @@ class Exchange:
         router.books.waiting = lambda: Counter(frame.source for frame, _ in self._waiting())
         self.holding = holding or Holding()
         self.alone: Set[Address] = frozenset()
-        """Robots that must hear nothing but the broker's own calls now."""
+        """Robots that must hear nothing now but the broker's own calls, and what stops everyone."""
         self._searches = Rarely()
         self._mistakes = 0
         self.resident: Resident
@@ -406,7 +406,19 @@ class Exchange:
 
     def _flood(self, frame: Frame, hops: tuple[Way, ...], way: Way, now: float, patience_s: float) -> Verdict | None:
         answered: Verdict = NO_ROUTE if way is SELF else self._answer(frame, way, now)
-        return self._spread(frame, hops, way, now, patience_s) if hops else answered
+        if not hops:
+            return answered
+        if self.alone and way is not SELF and lane(frame) != STOP_LANE:
+            hops = self._past_alone(hops, way)
+        return self._spread(frame, hops, way, now, patience_s) if hops else REFUSED
+
+    def _past_alone(self, hops: tuple[Way, ...], arrived: Way) -> tuple[Way, ...]:
+        """Those of `hops` by which what `arrived` for everyone comes to no robot that is to be left `alone`."""
+        routes = (self.router.find(robot) for robot in self.alone)
+        shut = {route.way for route in routes if route is not None and route.way.link != MESH}
+        # Who is at no far end that such frames go to may be reached by any of its link, as in a group.
+        whole = {way.link for way in shut if way not in hops and way != arrived}
+        return tuple(hop for hop in hops if hop not in shut and hop.link not in whole)
 
     # What a robot says must not break the link that brought it, nor the books, by a mistake in how it is understood.
 

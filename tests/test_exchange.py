@@ -177,6 +177,65 @@ def test_a_robot_that_must_be_left_alone_hears_the_broker_and_nobody_else(world:
     world.balances()
 
 
+def test_a_robot_that_must_be_left_alone_hears_of_frames_to_everyone_only_stops(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    world.exchange.alone = {Address.named("MNERIM"), Address.named("NOBODY")}
+    world.links["wifi"].received(wire("PC", "??", "anda", "100"), PEERS[0])
+    assert world.wires("radio") == []
+    assert world.wires("second") == [wire("PC", "??", "anda", "100")]
+    assert world.transports["wifi"].written == [(wire("PC", "??", "anda", "100"), PEERS[1])]
+    world.links["wifi"].received(wire("PC", "??", "pare"), PEERS[0])
+    assert world.wires("radio") == [wire("PC", "??", "pare")]
+    ours = psiu_ascii.message(BASE, EVERYONE, "qualseunome")
+    assert world.exchange.send(ours, world.now) == "delivered"
+    assert len(world.wires("radio")) == 2
+    assert world.verdicts("wifi") == {"delivered": 2}
+    world.balances()
+
+
+@pytest.mark.parametrize(
+    ("peer", "heard_by"), [(PEERS[0], [PEERS[1]]), (("127.0.0.1", 9003), [])], ids=["far end", "member of a group"]
+)
+def test_what_is_told_everyone_passes_a_far_end_where_one_must_be_left_alone(
+    world: World, peer: tuple[str, int], heard_by: list[tuple[str, int]]
+) -> None:
+    world.links["wifi"].received(wire("MNERIM", "base", "qualseunome"), peer)
+    world.exchange.alone = {Address.named("MNERIM")}
+    world.links["radio"].received(wire("PC", "??", "anda", "100"), None)
+    assert [each for _, each in world.transports["wifi"].written] == heard_by
+    world.links["wifi"].received(wire("MNERIM", "??", "oi"), peer)
+    assert [each for data, each in world.transports["wifi"].written if b"oi" in data] == [
+        each for each in PEERS if each != peer
+    ], "of what it says itself it hears nothing new"
+    world.balances()
+
+
+def test_what_would_be_told_only_those_who_must_be_left_alone_is_refused_and_answered(world: World) -> None:
+    world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
+    for link in ("wifi", "second"):
+        world.links[link].lost(LinkLost("unplugged"))
+    world.exchange.alone = {Address.named("MNERIM")}
+    way = Way(MESH, "hill")
+    frame = psiu_ascii.message(Address.named("PC"), EVERYONE, "qualseunome")
+    world.exchange.join(NoMesh(), 2.0)
+    assert world.exchange.relayed(frame, way, world.now, 0.0) == "refused"
+    assert world.resident.answered[-1] is frame
+    assert world.wires("radio") == []
+    world.balances()
+
+
+class NoMesh:
+    """Other brokers, none of whom is there."""
+
+    def offer(
+        self, frame: Frame, peer: object, arrived: Way, now: float, patience_s: float = 0.0, fate: Fate | None = None
+    ) -> Verdict | None:
+        return "link_down"
+
+    def ways(self) -> tuple[Way, ...]:
+        return ()
+
+
 def test_a_frame_with_a_wrong_size_is_forwarded_with_the_true_one(world: World) -> None:
     world.links["radio"].received(wire("MNERIM", "base", "qualseunome"), None)
     world.links["wifi"].received(b"MNERIM 131 parafrente 100 PC 02121", PEERS[0])
