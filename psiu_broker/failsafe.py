@@ -263,7 +263,7 @@ class Failsafe:
             del self._gone[next(iter(self._gone))]
 
     def _set_due(self, ward: Ward, loss: str, why: str) -> None:
-        if loss in ward.options.on and not ward.due:
+        if loss in ward.options.on and not (ward.due or self._closed):
             ward.due, ward.failed, ward.not_before = why, False, -inf
             later = "" if ward.link in self._open else f", once link {ward.link} is open"
             log.warning("%s is told to stop%s: %s", ward.robot, later, why)

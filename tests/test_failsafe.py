@@ -319,6 +319,15 @@ async def test_while_a_link_is_down_its_robots_are_told_nothing_and_one_line_say
     assert lab.stops == 0
 
 
+async def test_nothing_is_told_of_links_that_close_because_the_broker_ends(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("link_silent")
+    lab.moves()
+    await lab.failsafe.close()
+    lab.failsafe.link_closed("radio")
+    assert await lab.after(60) == 0
+    assert caplog.records == []
+
+
 async def test_a_stop_that_fails_again_and_again_is_told_once_and_so_is_its_end(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
