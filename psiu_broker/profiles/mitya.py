@@ -6,6 +6,7 @@ A 2012 body says nothing of a command that it carries out; what it cannot do it 
 
 import difflib
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple, Self
@@ -52,6 +53,7 @@ FILLERS: Final = 5
 """How often a body may be moved on by one byte; after so many it has been asked at each of the five places."""
 PLAY: Final = "play"
 
+_BURSTS_KEPT: Final = 8
 _STOPS: Final = ("pare",)
 _RESERVED: Final = STOP_WORDS | {NAME, COUNT, SHOW, SHOW_PRINTED}
 _SAID_BY_ROBOTS: Final = frozenset({"error", "telemetry", "hit"})
@@ -285,8 +287,8 @@ class MityaProfile(Profile):
         self._timeout_s = timeout_s if self._answers else robot.error_ms / 1000
         self._burst = 2 * (codec.repeat or 1)
         self._realigner = Realigner() if self.version == "2012" and codec.realign and not datagrams else None
-        self._burst_of: Request | None = None
-        self._burst_heard: list[Frame] = []
+        self._bursts: deque[tuple[Request, list[Frame]]] = deque(maxlen=_BURSTS_KEPT)
+        """What was heard so far of requests that are answered more than once."""
         self._volts: tuple[float, ...] = ()
 
     @classmethod
@@ -389,11 +391,13 @@ class MityaProfile(Profile):
         awaited = self._burst if request.subject in ONE_SHOTS else _answered(request.payload)
         if not self._answers or awaited == 1:
             return self._outcome(request, [frame])
-        if request is not self._burst_of:
-            self._burst_of, self._burst_heard = request, []
-        if not any(frame is heard for heard in self._burst_heard):
-            self._burst_heard.append(frame)
-        return self._outcome(request, self._burst_heard) if len(self._burst_heard) == awaited else None
+        heard = next((heard for asked, heard in self._bursts if asked is request), None)
+        if heard is None:
+            heard = []
+            self._bursts.append((request, heard))
+        if not any(frame is each for each in heard):
+            heard.append(frame)
+        return self._outcome(request, heard) if len(heard) == awaited else None
 
     def _outcome(self, request: Request, heard: Sequence[Frame]) -> Reply:
         error = next((frame for frame in heard if frame.subject == "error"), None)

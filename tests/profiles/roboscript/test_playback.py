@@ -141,6 +141,19 @@ def test_a_body_that_answers_each_message_has_answered_the_stop_with_the_last_of
     assert lab.robot.read(request, lab.ears.decode(b"#0000", 0.0)[0]) == Reply("sucesso")  # type: ignore[arg-type]
 
 
+def test_a_gesture_under_way_and_the_stop_that_comes_meanwhile_are_both_answered() -> None:
+    lab = Lab("2013")
+    lab.call("play", 3)
+    requests = [lab.robot.request("nod", []), lab.robot.request("stop", [])]
+    answers: list[int] = []
+    for number in range(3):
+        (done,) = lab.ears.decode(b"#0000", 0.0)
+        assert isinstance(done, Frame)
+        readings = [lab.robot.read(request, done) for request in requests]
+        answers += [number for reading in readings if reading is not None]
+    assert answers == [1, 2]
+
+
 @pytest.mark.parametrize("version", ["2012", "2013"])
 def test_where_every_slot_was_played_the_oldest_script_is_lost_and_the_caller_is_told(version: MityaVersion) -> None:
     lab = Lab(version, slots=range(10))
