@@ -57,6 +57,38 @@ def test_the_unit_is_hardened():
     assert "Overall exposure level" in result.stdout
 
 
+MAY = {
+    "User": ["psiu-broker"],
+    "SupplementaryGroups": ["dialout"],
+    "CapabilityBoundingSet": [""],
+    "AmbientCapabilities": [""],
+    "NoNewPrivileges": ["yes"],
+    "ProtectProc": ["invisible"],
+    "ProcSubset": ["pid"],
+    "ProtectSystem": ["strict"],
+    "ProtectHome": ["yes"],
+    "PrivateTmp": ["yes"],
+    "DevicePolicy": ["closed"],
+}
+WRITES = re.compile("ReadWrite|Bind|StateDirectory|CacheDirectory|LogsDirectory|ConfigurationDirectory")
+
+
+def settings() -> dict[str, list[str]]:
+    """What the unit says, by option."""
+    said: dict[str, list[str]] = {}
+    for option, value in re.findall(r"^(\w+)=(.*)$", SERVICE.read_text(), re.MULTILINE):
+        said.setdefault(option, []).append(value)
+    return said
+
+
+def test_the_service_may_no_more_than_the_threat_model_says():
+    said = settings()
+    assert {option: said.get(option) for option in MAY} == MAY
+    assert not [option for option in said if WRITES.match(option)], "it writes in its RuntimeDirectory only"
+    devices = [value.removeprefix("char-").removesuffix(" rw") for value in said["DeviceAllow"]]
+    assert set(devices) == {"ttyUSB", "ttyACM", "ttyAMA", "ttyS", "rfcomm"}
+
+
 def test_a_wrong_configuration_is_not_tried_again_and_anything_else_is_for_ever():
     unit = SERVICE.read_text().splitlines()
     assert {"Type=notify", "Restart=on-failure", "RestartPreventExitStatus=78", "StartLimitIntervalSec=0"} <= set(unit)
