@@ -97,7 +97,8 @@ class ZenohMesh:
         await session.serve(
             subscribe(f"frame/{me}/*/*", RING),
             bus._frame,
-            told(lambda it, now: mesh.frame_came(it[0], it[1], it[2], now)),
+            # Not `told`: what an earlier session still brings is for a former life of ours, and counted as that.
+            lambda it: mesh.frame_came(*it, time.monotonic()),
             name="mesh-frames",
         )
         await session.serve(subscribe(f"notice/{me}", TALK_RING), _notice, told(mesh.notice_came), name="mesh-notices")
@@ -109,9 +110,9 @@ class ZenohMesh:
 
     # mesh.MeshBus
 
-    def put_frame(self, to: str, lane: int, data: bytes) -> None:
+    def put_frame(self, to: str, lane: int, data: bytes) -> bool:
         key = f"{self._root}/frame/{chunk(to)}/{chunk(self._own)}/{lane}"
-        self._put(key, data, priority=PRIORITIES[lane], express=lane != QUESTION_LANE)
+        return self._put(key, data, priority=PRIORITIES[lane], express=lane != QUESTION_LANE)
 
     def put_beat(self, beat: Beat) -> None:
         self._put(f"{self._root}/beat/{chunk(self._own)}", beat.model_dump_json(), priority=zenoh.Priority.DATA_HIGH)
@@ -228,11 +229,15 @@ class ZenohMesh:
         chunks = key[len(self._root) + 1 :].split("/")[1:]
         return chunks if len(chunks) == count and "*" not in key else None
 
-    def _frame(self, sample: zenoh.Sample) -> tuple[str, int, bytes] | None:
+    def _frame(self, sample: zenoh.Sample) -> tuple[str, int, bytes]:
+        """What is none is handed on as a frame that nobody can read: each that comes is in the ledger."""
         chunks = self._chunks(str(sample.key_expr), 3)
         if chunks is None or sample.kind != zenoh.SampleKind.PUT or chunks[2] not in _LANES:
-            return None
-        return text(chunks[1]), int(chunks[2]), sample.payload.to_bytes()
+            return _UNREADABLE
+        try:
+            return text(chunks[1]), int(chunks[2]), sample.payload.to_bytes()
+        except ValueError:
+            return _UNREADABLE
 
     def _broker_token(self, sample: zenoh.Sample) -> Callable[[float], None] | None:
         chunks = self._chunks(str(sample.key_expr), 4)
@@ -263,7 +268,8 @@ class ZenohMesh:
             return lambda now: self._mesh.claimed(broker, life, claim, now)
         return lambda now: self._mesh.unclaimed(broker, life, claim, now)
 
-    def _put(self, key: str, payload: bytes | str, *, priority: Any, express: bool = False) -> None:
+    def _put(self, key: str, payload: bytes | str, *, priority: Any, express: bool = False) -> bool:
+        """False: Zenoh refused it."""
         try:
             self._session.zenoh.put(
                 key,
@@ -278,9 +284,12 @@ class ZenohMesh:
             self.failures += 1
             if not self._session.panicked(error):
                 logger.debug("to other brokers: %s", plain(error))
+            return False
+        return True
 
 
 _LANES: Final = frozenset(str(lane) for lane in PRIORITIES)
+_UNREADABLE: Final = ("", QUESTION_LANE, b"")
 
 
 def _number_below(chunk: str, end: int) -> int:

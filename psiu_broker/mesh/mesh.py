@@ -150,8 +150,9 @@ class Mesh:
         except EncodeError as error:
             log.debug("to broker %s: %s", neighbour.name, error)
             return REFUSED
+        if not self._bus.put_frame(neighbour.name, urgency, data):
+            return LINK_DOWN
         neighbour.number(urgency)
-        self._bus.put_frame(neighbour.name, urgency, data)
         return DELIVERED
 
     # What the bus brings.

@@ -6,7 +6,7 @@ Tokens behave as Zenoh's do: they come in their order, they go at once with a se
 
 import heapq
 import random
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import combinations, count
 from typing import Final, NamedTuple
@@ -56,6 +56,8 @@ class Session:
     """Implements `mesh.MeshBus` for one life of one broker."""
 
     linked = ()
+    refuses = False
+    """It takes no frame."""
 
     def __init__(self, simulation: "Simulation", name: str, serial: int) -> None:
         self.zenoh_id = f"{name}-{serial}"
@@ -65,11 +67,13 @@ class Session:
         self._epoch = 0
         self._edition = 0
 
-    def put_frame(self, to: str, lane: int, data: bytes) -> None:
-        name = self._name
-        self._simulation.send(
-            "frame", name, to, lambda it: it.dispatch(lambda: it.mesh.frame_came(name, lane, data, it.now))
-        )
+    def put_frame(self, to: str, lane: int, data: bytes) -> bool:
+        if self.refuses:
+            return False
+        self._simulation.frames.append((self._name, to, lane, data))
+        self._simulation.taken[self._name, self._epoch] += 1
+        self._simulation.put_frame(self._name, to, lane, data)
+        return True
 
     def put_beat(self, beat: Beat) -> None:
         self._simulation.beat = beat
@@ -330,6 +334,10 @@ class Simulation:
         """Those of them that never came."""
         self.beat: Beat | None = None
         """The last one."""
+        self.frames: deque[tuple[str, str, int, bytes]] = deque(maxlen=32)
+        """The last ones: from whom, to whom, their lane and their envelope."""
+        self.taken: Counter[tuple[str, int]] = Counter()
+        """Frames that the bus took, by broker and its life."""
         self.stations: dict[str, Station] = {}
         self.former: list[Station] = []
         self.bindings = bindings or {}
@@ -526,6 +534,13 @@ class Simulation:
 
     def reach(self, a: str, b: str) -> bool:
         return frozenset((a, b)) not in self._cut
+
+    def put_frame(self, sender: str, to: str, lane: int, data: bytes) -> None:
+        """Whoever may say that it is `sender`."""
+        self.send("frame", sender, to, lambda it: it.dispatch(lambda: it.mesh.frame_came(sender, lane, data, it.now)))
+
+    def session(self, name: str) -> Session:
+        return self._sessions[name]
 
     def send(self, kind: str, sender: str, to: str, deliver: Callable[[Station], None]) -> None:
         """In its order among its kind, unless it is lost."""

@@ -1,6 +1,8 @@
 """No frame is lost unseen: not in a broker, not on its links, and not from broker to broker."""
 
 from collections import Counter
+from collections.abc import Callable
+from typing import Any
 
 from balanced import assert_balanced
 from hypothesis import settings
@@ -11,7 +13,9 @@ from mesh.simulated import RADIO, WIFI, Simulation, Station, wire
 from psiu_broker.codecs import psiu_ascii
 from psiu_broker.frame import MESH, Address, Frame, Way
 from psiu_broker.link import Link
+from psiu_broker.mesh.envelope import Envelope, pack, unpack
 from psiu_broker.messages import RawFrame
+from psiu_broker.routing.outbox import LANES
 from psiu_broker.routing.policy import Policy, Rule
 
 LINKS = (RADIO, WIFI)
@@ -28,6 +32,22 @@ TIGHT = {
     "new_names_per_minute": 4,
 }
 """Everything that a frame can come to grief by."""
+
+
+CHANGES: dict[str, Callable[[Envelope], Envelope | bytes]] = {
+    "once more": lambda it: it,
+    "from another": lambda it: it,
+    "cut short": lambda it: pack(it)[:-9],
+    "too old": lambda it: it._replace(age_ms=60_000, sequence=it.sequence + 1),
+    "ahead of others": lambda it: it._replace(sequence=it.sequence + 3),
+    "far ahead": lambda it: it._replace(sequence=it.sequence + 1000),
+    "without a place": lambda it: it._replace(sequence=0),
+    "of a former life": lambda it: it._replace(epoch=it.epoch - 1),
+    "for a former life": lambda it: it._replace(to_epoch=it.to_epoch ^ 1),
+    "by a clock that is ahead": lambda it: it._replace(sent_us=2**64 - 1, sequence=it.sequence + 1),
+    "by a clock that is behind": lambda it: it._replace(sent_us=0, sequence=it.sequence + 1),
+}
+"""What an envelope can come as."""
 
 
 class Witness:
@@ -71,6 +91,7 @@ class NothingIsLostUnseen(RuleBasedStateMachine):
         self.few = few
         self.ever_stopped = False
         self.losing: frozenset[str] = frozenset()
+        self.came: Counter[int] = Counter()
         self.simulation = Simulation((), seed=seed, options=TIGHT)
         self.simulation.loses = lambda kind, *_: kind in self.losing
         for name in BROKERS[:2]:
@@ -82,6 +103,13 @@ class NothingIsLostUnseen(RuleBasedStateMachine):
     def _start(self, name: str) -> None:
         station = self.simulation.start(name)
         station.exchange.bus = Witness()
+        take, at = station.mesh.frame_came, id(station)
+
+        def frame_came(*what: Any) -> None:
+            self.came[at] += 1
+            take(*what)
+
+        station.mesh.frame_came = frame_came  # type: ignore[method-assign]
         if self.few:
             station.router.books._capacity = station.router.books._sweep_at = 4
         for link in station.exchange.links.values():
@@ -166,9 +194,40 @@ class NothingIsLostUnseen(RuleBasedStateMachine):
         if station is not None:
             station.router.obey(Policy([Rule(allow=False, command=(denied,))] if denied else []))
 
+    @rule(name=brokers, robots=st.sets(st.sampled_from(ROBOTS[:2])))
+    def robots_must_be_left_alone(self, name: str, robots: set[str]) -> None:
+        station = self._there(name)
+        if station is not None:
+            station.exchange.alone = set(map(Address.named, robots))
+
     @rule(losing=st.sets(st.sampled_from(("frame", "beat", "notice", "token", "untoken")), max_size=2))
     def the_network_loses(self, losing: set[str]) -> None:
         self.losing = frozenset(losing)
+
+    @rule(sender=brokers, to=brokers, lane=st.sampled_from(sorted(LANES)), data=st.binary(max_size=80))
+    def what_is_no_envelope_comes(self, sender: str, to: str, lane: int, data: bytes) -> None:
+        self.simulation.put_frame(sender, to, lane, data)
+
+    @rule(age=st.integers(0, 5), how=st.sampled_from(sorted(CHANGES)), anyone=brokers)
+    def an_envelope_comes_that_is_not_as_it_left(self, age: int, how: str, anyone: str) -> None:
+        self.a_robot_speaks("base1", WIFI, "PC", "BETA", ("parafrente", str(age)))
+        frames = self.simulation.frames
+        if frames:
+            sender, to, lane, data = frames[-1 - age % len(frames)]
+            envelope = unpack(data)
+            assert envelope is not None
+            changed = CHANGES[how](envelope)
+            self.simulation.put_frame(
+                anyone if how == "from another" else sender,
+                to,
+                lane,
+                changed if isinstance(changed, bytes) else pack(changed),
+            )
+
+    @rule(name=brokers, refuses=st.booleans())
+    def the_bus_takes_frames_or_does_not(self, name: str, refuses: bool) -> None:
+        if self._there(name) is not None:
+            self.simulation.session(name).refuses = refuses
 
     @rule(cut=st.booleans())
     def the_network_is_cut_or_healed(self, cut: bool) -> None:
@@ -215,6 +274,18 @@ class NothingIsLostUnseen(RuleBasedStateMachine):
     def nothing_waits_for_a_link_that_is_down(self) -> None:
         for station in self.simulation.stations.values():
             assert all(link.state == "open" or not link.outbox.size for link in station.exchange.links.values())
+
+    @invariant()
+    def whatever_comes_from_a_broker_is_in_the_books_at_once(self) -> None:
+        for station in (*self.simulation.stations.values(), *self.simulation.former):
+            assert station.exchange.accounts[MESH].arrived == self.came[id(station)]
+
+    @invariant()
+    def a_broker_says_that_it_sent_what_the_bus_took_and_nothing_else(self) -> None:
+        for station in self.simulation.stations.values():
+            mesh = station.mesh
+            sent = sum(each.frames_out for each in (*mesh.neighbours, *mesh._former.values()))
+            assert sent == self.simulation.taken[station.name, mesh.epoch]
 
     @invariant()
     def no_frame_comes_from_nowhere(self) -> None:

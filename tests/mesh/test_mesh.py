@@ -824,3 +824,20 @@ def test_what_is_no_frame_for_us_is_counted_and_dropped(mesh: Simulation, spoil:
     spoil(station)
     assert station.exchange.accounts[MESH].arrived == before + 1
     mesh.balances()
+
+
+def test_a_frame_that_the_bus_does_not_take_is_not_called_delivered() -> None:
+    simulation = Simulation(("base1", "base2"))
+    simulation.says("PC", ["base1"], "base1", "qualseunome", link=WIFI)
+    simulation.says("MNERIM", ["base2"], "base2", "qualseunome")
+    simulation.run(1.0)
+    simulation.session("base1").refuses = True
+    simulation.says("PC", ["base1"], "MNERIM", "parafrente", "1", link=WIFI)
+    simulation.run(0.1)
+    assert simulation.stations["base1"].exchange.accounts[WIFI].fates["link_down"] == 1
+    simulation.session("base1").refuses = False
+    said = simulation.says("PC", ["base1"], "MNERIM", "parafrente", "2", link=WIFI)
+    simulation.run(2.0)
+    assert simulation.transmitted(said) == 1
+    assert [each.lost for each in simulation.stations["base2"].neighbours] == [0], "nothing was counted as sent"
+    simulation.balances()
