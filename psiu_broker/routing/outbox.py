@@ -113,7 +113,8 @@ class Outbox:
     def put(self, parcel: Parcel) -> Parcel | None:
         """Queue `parcel`; if there was no room, the one that had to go: the oldest of the least urgent lane.
 
-        Of a box full of stops, it is the oldest of the way that has the most, `parcel` included.
+        Of a box full of stops, it is one of the way that has the most, `parcel` included, and among these the oldest
+        for the robot that has most.
         """
         evicted = None
         if self.size >= self._capacity:
@@ -210,10 +211,16 @@ class Outbox:
         waiting.append(stop)
 
     def _surplus_stop(self, newcomer: Parcel) -> Parcel:
-        """The oldest of those that came by the way that has the most."""
         waiting = self._lanes[STOP_LANE]
-        stops = Counter(each.fate.arrived for each in (*waiting, newcomer))
-        return max(waiting, key=lambda each: stops[each.fate.arrived])
+        stops: Counter[object] = Counter()
+        for each in (*waiting, newcomer):
+            stops.update((each.fate.arrived, (each.fate.arrived, each.fate.frame.destination)))
+
+        def surplus(each: Parcel) -> tuple[int, int]:
+            way, robot = each.fate.arrived, each.fate.frame.destination
+            return stops[way], stops[way, robot]
+
+        return max(waiting, key=surplus)
 
     def _take_out(self, unwanted: Callable[[Parcel], bool]) -> list[Parcel]:
         taken: list[Parcel] = []

@@ -261,6 +261,15 @@ def test_stops_for_everyone_are_damped_to_a_steady_rate(router: Router, said: st
     assert sum(a_thousand_a_second[2500:]) == pytest.approx(2.5 / STOP_EVERYONE_EVERY_S, abs=1)
 
 
+def test_stops_that_are_more_than_a_word_share_the_turns_of_one_and_leave_the_words_theirs(router: Router) -> None:
+    for number in range(STOP_EVERYONE_AT_ONCE):
+        assert passes(router, f"pare {number}", CABLE, 10.0, number)
+    assert not passes(router, "stop 1", CABLE, 10.0, 1)
+    assert not passes(router, "PARE", CABLE, 10.0, 1)
+    assert passes(router, "pare", CABLE, 10.0, 1)
+    assert passes(router, "stop 1", HIS, 10.0, 2), "another far end has its own"
+
+
 def test_the_answer_to_a_stop_is_damped_as_any_frame_to_everyone_is(router: Router) -> None:
     passed = [
         router.route(text(PC, EVERYONE, f"pare sucesso {number}", number), CABLE, 10.0).action == "flood"
