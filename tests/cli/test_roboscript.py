@@ -336,6 +336,23 @@ async def test_a_stop_ends_the_recording_and_stops_the_robot(tmp_path: Path) -> 
         assert made.body.scripts.get(3) is None
 
 
+@pytest.mark.parametrize(("version", "phone"), [("2012", False), ("2013", False), ("2012", True)])
+async def test_a_stop_ends_the_script_that_the_robot_plays(tmp_path: Path, version: str, phone: bool) -> None:
+    async with lab(tmp_path, MityaBody(version=version, phone=phone)) as made:  # type: ignore[arg-type]
+        uploaded = await made.run("upload", "MITYA", "3", made.file("drive 50\nwait 60000\ndrive 60\n"))
+        assert uploaded.exit_code == 0, uploaded.output
+        await made.run("play", "MITYA", "3")
+        await made.until(lambda: made.moves() == 50)
+        await made.call("stop")
+        await made.until(lambda: made.moves() == 0 and made.body.recording is None)
+        assert not made.body.playing
+        assert len(made.body.scripts[3]) == 2
+        answer = await made.call("drive", 7)
+        assert answer is not None
+        assert answer.status == ("sucesso" if version == "2013" else None)
+        await made.until(lambda: made.moves() == 7)
+
+
 async def test_nothing_else_reaches_a_robot_that_records(tmp_path: Path) -> None:
     async with lab(tmp_path) as made:
         upload = asyncio.create_task(made.run("upload", "MITYA", "3", made.file(LONG)))
