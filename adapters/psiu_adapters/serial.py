@@ -32,6 +32,9 @@ POLL_S = 1.0
 EMPTY_S = 0.1
 BAUD_TOLERANCE = 0.03
 TCGETS2 = 0x802C542A
+TIOCGICOUNT = 0x545D
+LINE_ERRORS = {"frame_errors": 6, "overruns": 7, "parity_errors": 8, "breaks": 9, "buffer_overruns": 10}
+"""Where each is among the 20 numbers that a driver counts, of bytes that never came to us as they were sent."""
 UNSENT_MAX = 4096
 """Bytes that the kernel holds back for a slow network port: by default megabytes, and an urgent frame behind them."""
 USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})(?::(.+))?")
@@ -235,11 +238,15 @@ class _SerialTransport(DescriptorTransport):
             close=pump.close if pump else _closer(port),
             name=options.device,
         )
+        self._port = port
+        self._errors_before = _line_errors(port)
         if "hint" in facts:
             log.warning("%s: %s", options.device, facts["hint"])
 
     def status(self) -> Mapping[str, str | int | float]:
-        return self._facts
+        before = self._errors_before
+        errors = {name: count - before[name] for name, count in _line_errors(self._port).items() if name in before}
+        return self._facts | errors
 
 
 def _nothing() -> None: ...
@@ -271,6 +278,15 @@ def _closer(port: serial.Serial) -> Callable[[], None]:
 
 def _waiting_bytes(descriptor: int) -> int:
     return int(struct.unpack("I", fcntl.ioctl(descriptor, termios.TIOCOUTQ, b"\0" * 4))[0])
+
+
+def _line_errors(port: serial.Serial) -> Mapping[str, int]:
+    """What the driver has counted since it found the device; nothing where it counts nothing, as for a pty."""
+    try:
+        counted = struct.unpack("20i", fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(80)))
+    except OSError:
+        return {}
+    return {name: counted[place] for name, place in LINE_ERRORS.items()}
 
 
 def _actual_baudrate(descriptor: int) -> int | None:

@@ -179,6 +179,8 @@ def show_links(found: Links, *, drawn: bool) -> None:
                 click.echo(f"{link.name} is {link.state}: {printable(link.reason)}")
             if link.unasked:
                 click.echo(f"{link.name}: {link.unasked} questions of its own left unasked, to spare the line")
+            if losses := [f"{count} {words}" for what, words in _LOSSES.items() if (count := link.details.get(what))]:
+                click.echo(printable(f"{link.name}: {', '.join(losses)}"))
         return
     print_rows(
         (link.name, link.adapter, link.protocol, link.state, link.reason, link.robots, link.frames_in, link.frames_out,
@@ -291,5 +293,18 @@ def _route(route: Route) -> Sequence[Cell]:
 def _where(link: str, peer: str | None) -> str:
     return link if peer is None else f"{link}/{peer}"
 
+
+_LOSSES: Final[Mapping[str, str]] = {
+    "refused": "datagrams of senders that are not let in",
+    "oversized": "datagrams too long to be whole",
+    "lost": "datagrams that the broker came too late for",
+    "send_errors": "datagrams that the network refused",
+    "overruns": "bytes that the serial port lost",
+    "buffer_overruns": "bytes for which its driver had no room",
+    "frame_errors": "bytes out of step, as with another baud rate",
+    "parity_errors": "bytes with a wrong parity",
+    "no_room": "packets for which the line had no room",
+}
+"""What is gone before it is a frame, or after, and so is in no ledger; by its name in `Link.details`."""
 
 _EVERYBODYS: Final = frozenset(command.name for command in QUESTIONS)

@@ -5,6 +5,7 @@ import fcntl
 import os
 import select
 import socket
+import struct
 import threading
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from adapter_contract import FRAME, Recorder, open_descriptors
 from pty_robot import Pty
 from serial.urlhandler import protocol_socket
 
+from psiu_adapters import serial
 from psiu_adapters.serial import Serial
 from psiu_broker.errors import LinkAbsent, LinkError
 
@@ -194,3 +196,40 @@ class TestUrls:
         await transport.close()
         assert "A5" in capsys.readouterr().err
         assert len(open_descriptors()) == len(before) - 1
+
+
+async def test_what_the_uart_lost_since_it_was_opened_is_told(
+    tmp_path: Path, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = [0, 0, 0, 0, 900, 900, 2, 30, 4, 5, 6, *[0] * 9]
+    real = fcntl.ioctl
+
+    def ioctl(descriptor: int, request: int, *arguments: Any) -> Any:
+        if request != serial.TIOCGICOUNT:
+            return real(descriptor, request, *arguments)
+        return struct.pack("20i", *counted)
+
+    far = Pty(tmp_path / "uart")
+    monkeypatch.setattr(serial.fcntl, "ioctl", ioctl)
+    transport = await far.adapter.open(recorder)
+    counted[7] += 3
+    counted[10] += 1
+    status = transport.status()
+    assert {name: status[name] for name in serial.LINE_ERRORS} == {
+        "frame_errors": 0,
+        "overruns": 3,
+        "parity_errors": 0,
+        "breaks": 0,
+        "buffer_overruns": 1,
+    }
+    await transport.close()
+    assert "device" in transport.status()
+    far.unplug()
+
+
+async def test_a_driver_that_counts_nothing_tells_nothing_of_losses(tmp_path: Path, recorder: Recorder) -> None:
+    far = Pty(tmp_path / "uart")
+    transport = await far.adapter.open(recorder)
+    assert not serial.LINE_ERRORS.keys() & transport.status().keys()
+    await transport.close()
+    far.unplug()

@@ -12,6 +12,7 @@ import pytest
 from click.testing import Result
 
 from psiu_broker.bus.client import Client
+from psiu_broker.cli.tables import show_links
 from psiu_broker.messages import Card, Health, Ledger, Link, Route, Status, Why
 
 Run = Callable[..., Result]
@@ -142,3 +143,12 @@ def test_a_prefix_without_brokers_is_no_broker(lab: Any) -> None:
     for command in ("robots", "links", "status", "discover"):
         refused = lab.run(command, "--prefix", "elsewhere")
         assert (refused.exit_code, refused.stderr) == (3, f"psiu: there is no broker at {lab.endpoint}\n")
+
+
+def test_what_was_lost_before_it_was_a_frame_is_said_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    usual = {"adapter": "udp", "protocol": "psiu-ascii", "state": "open", "since": "2024-01-01T00:00:00Z"}
+    lossy = Link(name="wifi", **usual, details={"refused": 3, "lost": 2, "oversized": 0, "listen": "127.0.0.1:9000"})
+    whole = Link(name="lab", **usual, details={"refused": 0, "lost": 0, "oversized": 0})
+    show_links([("base", lossy), ("base", whole)], drawn=True)
+    said = capsys.readouterr().out.splitlines()[3:]
+    assert said == ["wifi: 3 datagrams of senders that are not let in, 2 datagrams that the broker came too late for"]
