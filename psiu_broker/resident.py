@@ -24,6 +24,7 @@ from psiu_broker.profiles.hexa import NAK
 from psiu_broker.profiles.psiu import NAME, canonical, said
 from psiu_broker.profiles.rarely import Rarely
 from psiu_broker.profiles.responder import outcome, refusal
+from psiu_broker.routing.outbox import STOP_LANE, lane
 from psiu_broker.routing.table import Route
 from psiu_broker.routing.verdicts import ANSWERED, LINK_DOWN, REFUSED, Verdict
 
@@ -37,6 +38,8 @@ NAME_WITHIN_S: Final = 2.0
 """How long after our question a name is its answer."""
 NAK_EVERY_S: Final = 0.1
 TASKS_KEPT: Final = 64
+STOPS_KEPT: Final = 8
+"""Of one robot, besides."""
 _TALKING: Final = frozenset({psiu_ascii.PROTOCOL, psiu_hexa.PROTOCOL})
 """The protocols in which the broker is a robot among others, with a name or a number of its own."""
 
@@ -99,14 +102,14 @@ class Resident:
         if frame.protocol != psiu_ascii.PROTOCOL:
             return REFUSED
         route = self._router.find(frame.destination)
-        if route is None or len(self._tasks) >= TASKS_KEPT:
+        if route is None or not self._has_room(frame, route):
             return REFUSED
         down = self._exchange.links[route.way.link].state != "open"
         told = None if down else self._responder.listed(frame, str(route.robot), self.commands(route), now)
         if told is not None:
             self._exchange.send(told, now)
         elif not said(frame).answer:
-            self._start(self._ask_for(frame, route, way, now))
+            self._start(self._ask_for(frame, route, way, now), _name(frame, route))
         return LINK_DOWN if down else ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
@@ -300,7 +303,19 @@ class Resident:
             if told is not None and self._say(told) == REFUSED:  # too long for the sender's protocol
                 self._say(refusal(frame, name))
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
+    def _has_room(self, frame: Frame, route: Route) -> bool:
+        """Whether `frame` can be done for its sender; of more stops of one robot, those under way stop it as well."""
+        if lane(frame) != STOP_LANE:
+            return len(self._tasks) < TASKS_KEPT
+        name = _name(frame, route)
+        return sum(task.get_name() == name for task in self._tasks) < STOPS_KEPT
+
+    def _start(self, work: Coroutine[Any, Any, None], name: str | None = None) -> None:
+        task = asyncio.get_running_loop().create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+
+def _name(frame: Frame, route: Route) -> str | None:
+    """By which the stops of one robot are known among what goes on."""
+    return f"stop {route.robot}" if lane(frame) == STOP_LANE else None

@@ -29,7 +29,7 @@ from psiu_broker.profiles import Node
 from psiu_broker.profiles.hexa import HexaOptions
 from psiu_broker.profiles.rarely import REMEMBERED
 from psiu_broker.profiles.responder import NAMES_AT_ONCE
-from psiu_broker.resident import TASKS_KEPT, Resident
+from psiu_broker.resident import STOPS_KEPT, TASKS_KEPT, Resident
 from psiu_broker.routing.router import Router
 from psiu_broker.routing.table import Binding, Route
 
@@ -262,6 +262,17 @@ async def test_what_waits_for_a_silent_arm_is_bounded(labs: Labs) -> None:
     for _ in range(TASKS_KEPT + 2):
         lab.hears("radio", wire("PC", "BRACO", "sonar"))
     assert lab.exchange.accounts["radio"].fates["refused"] == 2
+
+
+async def test_a_stop_in_words_has_room_whatever_waits_and_a_flood_of_stops_is_bounded(labs: Labs) -> None:
+    lab = labs(words(), arm())
+    for _ in range(TASKS_KEPT + 2):
+        lab.hears("radio", wire("PC", "BRACO", "sonar"))
+    account = lab.exchange.accounts["radio"]
+    for _ in range(STOPS_KEPT + 3):
+        lab.hears("radio", wire("PC", "BRACO", "pare"))
+    assert account.fates["refused"] == 2 + 3
+    assert len(lab.resident._tasks) == TASKS_KEPT + STOPS_KEPT
 
 
 async def test_what_is_said_for_others_is_not_logged_frame_by_frame(
