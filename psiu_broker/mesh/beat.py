@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 Micros = Annotated[int, Field(ge=0, lt=2**63)]
 Epoch = Annotated[int, Field(ge=0, lt=2**64)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+Name = Annotated[str, Field(max_length=255)]
+Counts = Annotated[dict[int, Count], Field(max_length=16)]
+"""By lane."""
 
 
 class Beat(BaseModel):
@@ -20,18 +23,18 @@ class Beat(BaseModel):
     epoch: int = Field(ge=0, lt=2**64, description="which life of the broker this is")
     zenoh_id: str = Field(default="", max_length=32)
     sent_us: Micros = Field(description="by the sender's clock")
-    heard: dict[str, tuple[Micros, Micros]] | None = Field(
+    heard: dict[Name, tuple[Micros, Micros]] | None = Field(
         default=None,
         max_length=4096,
         description="for each broker the `sent_us` of its last beat, and how long ago that came; not in every beat",
     )
-    sent: dict[str, tuple[Epoch, dict[int, Count]]] = Field(
+    sent: dict[Name, tuple[Epoch, Counts]] = Field(
         default={},
         max_length=4096,
         description="how many frames each broker, in which life of its, was sent, by lane; not in every beat",
     )
     claims: str = Field(default="", max_length=64, description="the digest of what the sender claims")
-    unseen: list[str] = Field(
+    unseen: list[Name] = Field(
         default=[], max_length=4096, description="whose announcements the sender lacks: they should declare anew"
     )
 

@@ -28,6 +28,17 @@ def test_a_beat_is_the_same_after_its_way_as_json() -> None:
         {"heard": {"B": (1,)}},
         {"heard": {"B": (1, -1)}},
         {"heard": {str(number): (1, 1) for number in range(5000)}},
+        {"heard": {"x" * 256: (1, 1)}},
+        {"sent": {str(number): (1, {}) for number in range(5000)}},
+        {"sent": {"x" * 256: (1, {})}},
+        {"sent": {"B": (2**64, {})}},
+        {"sent": {"B": (1, {0: -1})}},
+        {"sent": {"B": (1, {0: 2**63})}},
+        {"sent": {"B": (1, dict.fromkeys(range(17), 1))}},
+        {"unseen": [str(number) for number in range(5000)]},
+        {"unseen": ["x" * 256]},
+        {"broker": "x" * 256},
+        {"zenoh_id": "0" * 33},
         {"claims": "x" * 65},
     ],
 )
@@ -38,7 +49,9 @@ def test_a_beat_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
         Beat.model_validate(right | wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"broker": ""}, {"quality": 11}, {"quality": -1}, {"frame": "0" * 200_001}])
+@pytest.mark.parametrize(
+    "wrong", [{"broker": ""}, {"broker": "x" * 256}, {"quality": 11}, {"quality": -1}, {"frame": "0" * 200_001}]
+)
 def test_a_notice_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         Notice.model_validate({"broker": "A"} | wrong)
