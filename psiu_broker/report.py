@@ -292,8 +292,10 @@ class Report:
                 reason = f"the configuration puts {source} on {origin.home}"
             case "denied":
                 reason = str(last.rule)
+            case "refused":
+                reason = f"nobody is called {source}"
             case _:
-                reason = _REASONS.get(last.verdict, last.verdict)
+                reason = _REASONS.get(last.verdict, verdicts.MEANINGS[last.verdict])
         what = f"{last.subject or 'a frame'} for {last.destination} from {last.way}"
         count = f"{last.count} frames of {source}, the last" if last.count > 1 else f"a frame of {source}"
         return f"turned away: {count} {ago_s:.1f} s ago, {what} ({last.verdict}): {reason}"

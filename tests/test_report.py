@@ -227,3 +227,16 @@ def test_storms_and_names_too_many_are_told(world: World) -> None:
         .steps[-1]
         .endswith("(too_many_names): more new names than new_names_per_minute came on that link")
     )
+
+
+def test_who_says_to_be_everyone_is_nobody(world: World) -> None:
+    world.router.route(message(EVERYONE, MNERIM, "parafrente", "1"), Way("wifi"), world.now)
+    assert (
+        world.why(EVERYONE, MNERIM).steps[-1].endswith("parafrente for MNERIM from wifi (refused): nobody is called ??")
+    )
+
+
+def test_a_name_that_went_from_the_table_was_still_used_elsewhere_than_it_may_be(world: World) -> None:
+    far = Address.named("AFAR")
+    world.router.guard.refused(message(far, MNERIM, "pare"), "spoofed", Way("wifi"), world.now)
+    assert world.why(far, MNERIM).steps[-1].endswith("(spoofed): the configuration puts its source elsewhere")

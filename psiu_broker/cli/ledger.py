@@ -14,6 +14,7 @@ from psiu_broker.cli.connection import Connection, connects
 from psiu_broker.cli.output import Cell, on_terminal, print_json, print_line, print_rows, print_table, styled
 from psiu_broker.cli.tables import with_brokers
 from psiu_broker.messages import Account, Ledger, RobotAccount
+from psiu_broker.routing.verdicts import MEANINGS
 
 Ledgers = Sequence[tuple[str, Ledger]]
 """By broker."""
@@ -70,6 +71,8 @@ def ledger(connection: Connection, robot: str | None, robots: bool, watch: bool)
 def show_ledger(found: Ledgers, *, drawn: bool, rates: Rates | None = None) -> None:
     accounts = [(broker, account) for broker, each in found for account in (*each.accounts, each.total)]
     _show([(broker, (account.link,), account) for broker, account in accounts], ("link",), rates, drawn=drawn)
+    if drawn:
+        _explain([account for _, account in accounts])
     for broker, each in found if drawn else ():
         if wrong := unbalanced(each):
             click.echo(styled(f"The books of {broker} do NOT balance: {'; '.join(wrong)}.", fg="red"))
@@ -101,6 +104,8 @@ def _failure(wrong: Sequence[str]) -> Failure:
 def show_robots(found: Robots, *, drawn: bool, rates: Rates | None = None) -> None:
     rows = [(broker, (each.robot, each.link), each) for broker, each in found]
     _show(rows, ("robot", "link"), rates, drawn=drawn)
+    if drawn:
+        _explain([account for _, account in found])
 
 
 def _looks(
@@ -178,6 +183,14 @@ def _show(
     watched = () if rates is None else ("a second",)
     told = [(broker, (*names, *_rate(rates, broker, names), *_cells(account))) for broker, names, account in rows]
     print_table(*with_brokers((*heads, *watched, *_HEADS), told), "No frame has arrived yet.")
+
+
+def _explain(accounts: Sequence[Account | RobotAccount]) -> None:
+    """Say in words why anything was dropped that was."""
+    reasons = {reason for account in accounts for reason, count in account.dropped.items() if count}
+    for verdict, meaning in MEANINGS.items():
+        if verdict in reasons:
+            click.echo(f"{verdict}: {meaning}")
 
 
 def _rate(rates: Rates | None, broker: str, names: Sequence[Cell]) -> Sequence[Cell]:

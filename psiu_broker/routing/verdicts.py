@@ -1,5 +1,6 @@
 """The closed set of fates of a frame, and the books that must balance."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
@@ -57,6 +58,26 @@ MALFORMED: Final = "malformed"
 
 UNREACHED: Final[frozenset[Verdict]] = frozenset({NO_ROUTE, LINK_DOWN, EXPIRED, QUEUE_FULL, REFUSED})
 """The verdicts of which a sender may be told that its robot was not reached."""
+
+MEANINGS: Final[Mapping[Verdict, str]] = {
+    DELIVERED: "it was handed to the line of at least one link",
+    ANSWERED: "it was for the broker, or for a robot that the broker speaks for",
+    NO_ROUTE: "nobody knows its destination, and nobody answered to that name",
+    EXPIRED: "it waited longer than it may: max_age_s, question_max_age_s",
+    QUEUE_FULL: "more waited for the link than may, and it was the least urgent: queue_frames",
+    SUPERSEDED: "a stop or a newer set-point took its place before it was sent",
+    DUPLICATE: "it came by another way a moment before",
+    SAME_WAY: "its destination is where it came from, and has heard it",
+    REFUSED: "its link or protocol cannot carry it, its robot is to be left alone, or nobody is called as its source",
+    DENIED: "a rule keeps such commands from its destination: psiu why",
+    SPOOFED: "the configuration puts its source elsewhere",
+    TOO_MANY_NAMES: "more new names came on its link than may: new_names_per_minute",
+    QUARANTINED: "another robot has its source's name: psiu conflicts",
+    STORM: "too many frames to everyone came from its link",
+    LINK_DOWN: "the link to its destination is down, or went down while it waited",
+    MALFORMED: "bytes that were no frame",
+}
+"""In words, for people."""
 
 KEPT: Final[frozenset[Verdict]] = frozenset({DELIVERED, ANSWERED})
 """The verdicts that are not a drop."""

@@ -5,12 +5,14 @@ import os
 import pty
 import signal
 import subprocess
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from psiu_broker.bus.client import Client
-from psiu_broker.messages import Ledger, RobotAccount
+from psiu_broker.cli.ledger import show_ledger
+from psiu_broker.messages import Account, Ledger, RobotAccount
+from psiu_broker.routing.verdicts import KEPT, MEANINGS, Verdict
 
 
 def test_robot_by_robot_the_sums_are_those_of_all_links(lab: Any) -> None:
@@ -111,3 +113,24 @@ def test_a_robot_of_whom_more_was_dropped_than_came_fails_aloud(lab: Any, monkey
     result = lab.run("ledger", "MNERIM")
     assert result.exit_code == 1
     assert "MNERIM 1 arrived, -1 delivered" in result.stderr
+
+
+def test_every_reason_for_a_drop_that_occurs_is_told_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    assert set(MEANINGS) == set(get_args(Verdict))
+    dropped = {verdict: 1 for verdict in MEANINGS if verdict not in KEPT}
+    count = len(dropped)
+    account = Account(link="radio", arrived=count + 1, delivered=1, answered=0, dropped={**dropped, "newer": 0})
+    told = Ledger(accounts=[account], total=account.model_copy(update={"link": "total"}), balances=True)
+    show_ledger([("base", told)], drawn=True)
+    said = capsys.readouterr().out
+    assert all(f"\n{verdict}: {MEANINGS[verdict]}\n" in said for verdict in dropped)
+    assert "\nThe books of base balance: " in said
+    show_ledger([("base", told)], drawn=False)
+    assert "balance" not in capsys.readouterr().out
+
+
+def test_what_does_not_add_up_is_shown_in_the_place_of_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
+    account = Account(link="radio", arrived=3, delivered=1, answered=0, dropped={"expired": 1})
+    told = Ledger(accounts=[account], total=account, balances=True)
+    show_ledger([("base", told)], drawn=True)
+    assert "The books of base do NOT balance: radio 3 arrived, 1 delivered, 2 in all" in capsys.readouterr().out
