@@ -3,7 +3,7 @@
 import functools
 import operator
 from collections.abc import Callable, Mapping
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 from zlib import adler32
 
 Check = Callable[[bytes], int]
@@ -12,6 +12,13 @@ Check = Callable[[bytes], int]
 CheckName = Literal["smbus", "maxim-dow", "dvb-s2", "nrsc-5", "xor", "sum", "negsum", "none"]
 
 _ADLER_EXACT: Final = 256
+
+
+class Crc(NamedTuple):
+    """An eight-bit CRC: what each byte makes of its state, and the first state."""
+
+    table: tuple[int, ...]
+    start: int = 0
 
 
 def byte_sum(data: bytes) -> int:
@@ -41,8 +48,8 @@ def _remainder(byte: int, polynomial: int, *, reflected: bool) -> int:
     return byte
 
 
-def _crc8(polynomial: int, *, start: int = 0, reflected: bool = False) -> Check:
-    table = crc8_table(polynomial, reflected=reflected)
+def _crc8(crc: Crc) -> Check:
+    table, start = crc
 
     def crc8(data: bytes) -> int:
         value = start
@@ -65,11 +72,17 @@ def _negsum(data: bytes) -> int:
     return -sum(data) & 0xFF
 
 
+CRCS: Final[Mapping[CheckName, Crc]] = {
+    "smbus": Crc(crc8_table(0x07)),
+    "maxim-dow": Crc(crc8_table(0x31, reflected=True)),
+    "dvb-s2": Crc(crc8_table(0xD5)),
+    "nrsc-5": Crc(crc8_table(0x31), start=0xFF),
+    "xor": Crc(tuple(range(256))),
+}
+"""Those of the checks that are CRCs, of which the exclusive or is the simplest."""
+
 CHECKS: Final[Mapping[CheckName, Check | None]] = {
-    "smbus": _crc8(0x07),
-    "maxim-dow": _crc8(0x31, reflected=True),
-    "dvb-s2": _crc8(0xD5),
-    "nrsc-5": _crc8(0x31, start=0xFF),
+    **{name: _crc8(crc) for name, crc in CRCS.items()},
     "xor": _xor,
     "sum": _sum,
     "negsum": _negsum,

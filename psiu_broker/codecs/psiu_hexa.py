@@ -13,8 +13,8 @@ step is lost: one byte is dropped and each following place is tried as a beginni
 add up. A point-to-point packet names nobody, so there only a silence restores the step.
 
 A decision needs nothing but the bytes up to it, so however the stream is cut, the packets are the
-same. What waits is at most one packet, and each byte is looked at once, besides the checks of
-the finds that cover it.
+same. What waits is at most one packet. However many finds cover a byte, it is looked at once for
+all their CRCs (`crc_parts`); sums are so cheap that each is made anew.
 """
 
 from collections.abc import Sequence
@@ -23,8 +23,9 @@ from typing import ClassVar, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from psiu_broker.codecs.checksums import CHECKS, CheckName
+from psiu_broker.codecs.checksums import CHECKS, CRCS, CheckName
 from psiu_broker.codecs.codec import Codec, Directory, Event
+from psiu_broker.codecs.crc_parts import CrcParts
 from psiu_broker.codecs.fragments import LONGEST_PAYLOAD, Piece, Reassembly, fields, join_fields, split
 from psiu_broker.codecs.noise import Noise
 from psiu_broker.errors import EncodeError
@@ -98,7 +99,11 @@ class PsiuHexa(Codec):
         self.dialect = "/".join(filter(None, (PROTOCOL, options.topology, options.size, options.crc, options.domain)))
         self._heard_dialect = self.dialect if options.topology == "ad-hoc" else f"{self.dialect}/heard"
         self._check = CHECKS[options.crc]
+        self._parts = CrcParts(CRCS[options.crc]) if options.crc in CRCS else None
+        """What is begun, while finds are looked for in it."""
         self._carried = _CARRIED[options.topology]
+        self._end = None if self._check is None else -1
+        """Where in a packet the payload ends."""
         around = self._carried + (1 if self._check is None else 2)
         """Bytes of a packet besides its payload."""
         self._least = 4 if options.size == "nominal" else around
@@ -184,7 +189,7 @@ class PsiuHexa(Codec):
 
     def _frame(self, wire: bytes) -> Frame:
         carried = self._carried
-        payload = wire[carried + 1 :] if self._check is None else wire[carried + 1 : -1]
+        payload = wire[carried + 1 : self._end]
         if carried == 2:
             source = self._addresses[wire[0]]
             destination = self._addresses[wire[1]]
@@ -213,7 +218,7 @@ class PsiuHexa(Codec):
                     reason = _BAD_SIZE
                 elif end - at >= length:
                     wire = buffer[at : at + length]
-                    if (check is None or check(wire[:-1]) == wire[-1]) and not (lost and self._is_odd(wire)):
+                    if self._is_find(buffer, at, wire) if lost else check is None or check(wire[:-1]) == wire[-1]:
                         self._noise.add(buffer[dropped:at], events)
                         self._noise.end(self._reason, events)
                         self._reason = ""
@@ -230,6 +235,8 @@ class PsiuHexa(Codec):
             at += 1
         self._noise.add(buffer[dropped:at], events)
         self._begun = buffer[at:]
+        if self._parts is not None:
+            self._parts.forget(at)
         if closed:
             self._noise.end(self._reason, events)
             self._reason = ""
@@ -251,9 +258,17 @@ class PsiuHexa(Codec):
                     return place
         return len(buffer) if closed else max(at, len(buffer) - carried)
 
+    def _is_find(self, buffer: bytes, at: int, wire: bytes) -> bool:
+        """Whether what may be the packet `wire`, which begins at `at`, is one although the step is lost."""
+        if self._parts is not None:
+            right = self._parts.of(buffer, at, at + len(wire) - 1) == wire[-1]
+        else:
+            right = self._check is None or self._check(wire[:-1]) == wire[-1]
+        return right and not self._is_odd(wire)
+
     def _is_odd(self, wire: bytes) -> bool:
         """Whether a find is a complex packet whose fields do not add up; pieces of a longer message never do."""
-        payload = self._frame(wire).payload
+        payload = wire[self._carried + 1 : self._end]
         return len(payload) > 2 and self._reassembly is None and fields(payload) is None
 
     def _joined(self, reassembly: Reassembly, frame: Frame, now: float) -> list[Event]:

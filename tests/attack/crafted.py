@@ -6,7 +6,7 @@ from itertools import cycle, islice
 from typing import Any, Final
 
 from psiu_broker.codecs.amarino import Amarino
-from psiu_broker.codecs.checksums import byte_sum
+from psiu_broker.codecs.checksums import CHECKS, byte_sum
 from psiu_broker.codecs.codec import Codec, Directory
 from psiu_broker.codecs.firmata import Firmata
 from psiu_broker.codecs.mitya import Mitya
@@ -36,6 +36,26 @@ def ascii_frame(destination: bytes, words: bytes, source: bytes, *, size: int | 
     length = len(destination) + len(words) + len(source) + 12
     summed = b"%b %03d %b %b " % (destination, length if size is None else size, words, source)
     return b"%b%05d" % (summed, byte_sum(summed))
+
+
+_ODD: Final = 40
+"""So many fields of so many bytes each are more than any packet holds."""
+
+
+def odd_finds(size: int) -> bytes:
+    """A packet of PSIU HEXA begins with nearly each byte; many have a right check byte, and no fields that add up."""
+    check = CHECKS["smbus"]
+    assert check is not None
+    made = bytearray(3)
+    begins: dict[int, int] = {}
+    sizes = cycle(range(_ODD, 60))
+    while len(made) < size:
+        begin = begins.pop(len(made), None)
+        right = 0 if begin is None else check(bytes(made[begin:]))
+        made.append(right if right >= _ODD else next(sizes))
+        begin = len(made) - 3
+        begins[begin + made[-1] - 1] = begin
+    return bytes(made)
 
 
 def _ascii(**options: Any) -> Callable[[], Codec]:
@@ -87,6 +107,7 @@ _HEXA_BAITS: Final[Mapping[str, bytes]] = {
     "in turns": bytes((1, 255)),
     "shortest everywhere": b"\x04",
     "first pieces": bytes((1, 2, 255, 255, *([255] * 249), 0)),
+    "long heads behind pings": bytes.fromhex("010204 5d 0102fe") + b"\xff" * 5,
 }
 
 CRAFTS: Final[Sequence[Craft]] = (
@@ -97,6 +118,7 @@ CRAFTS: Final[Sequence[Craft]] = (
         for name in ("frames", "digits", "endings")
     ),
     *(Craft(f"psiu-hexa, {name}", _hexa(fragment=True), bait) for name, bait in _HEXA_BAITS.items()),
+    Craft("psiu-hexa, odd finds", _hexa(), odd_finds(16_000)),
     *(Craft(f"psiu-hexa none, {name}", _hexa(crc="none", size="real"), bait) for name, bait in _HEXA_BAITS.items()),
     Craft("psiu-hexa master-slave, longest everywhere", _hexa(topology="master-slave"), b"\xfe"),
     Craft("psiu-hexa point-to-point, noise", _hexa(topology="point-to-point"), b"\xfe"),

@@ -14,6 +14,8 @@ from psiu_broker.codecs.psiu_hexa import PsiuHexa, packet
 from psiu_broker.frame import MALFORMED_KEPT, Address, Frame, Malformed
 
 KNOWN = {1, 2, 3, 5, 255}
+BEGINNINGS = [1, 2, 3, 4, 5, 6, 9, 30, 200, 254, 255]
+"""Bytes of which nearly each may begin a packet for a known robot."""
 
 forms = st.fixed_dictionaries(
     {
@@ -102,6 +104,18 @@ def test_any_cut_of_the_bytes_gives_the_same_events(stream: tuple[dict[str, Any]
 def test_one_byte_at_a_time_gives_the_same_events(stream: tuple[dict[str, Any], bytes]) -> None:
     options, data = stream
     assert read(hexa_codec(options), *(bytes((byte,)) for byte in data)) == read(hexa_codec(options), data)
+
+
+@given(options=forms, seed=st.integers(0, 2**32), size=st.integers(1, 300))
+def test_finds_are_the_same_as_where_each_is_checked_byte_by_byte(
+    options: dict[str, Any], seed: int, size: int
+) -> None:
+    data = bytes(random.Random(seed).choices(BEGINNINGS, k=900))
+    pieces = [data[at : at + size] for at in range(0, len(data), size)]
+    codec, plain = hexa_codec(options), hexa_codec(options)
+    plain._parts = None
+    for _ in range(2):
+        assert read(codec, *pieces) == read(plain, *pieces)
 
 
 @given(options=forms, pieces=st.lists(st.binary(max_size=300), max_size=8))
