@@ -142,9 +142,13 @@ class Client:
             return
         if not self._asked_rights:
             name = read_certificate(self._tls.certificate).name
-            for broker, config in self.ask("config").items():
+            ours = {str(each.zid) for each in self._session.info.transports()}
+            for broker in self.brokers():
+                if broker.zenoh_id not in ours:
+                    continue  # it takes what ours lets through
+                config = self.ask("config", broker=broker.broker).get(broker.broker)
                 if name not in _commanders(config, name):
-                    text = f"broker {broker} lets {name} only listen; nothing was sent"
+                    text = f"broker {broker.broker} lets {name} only listen; nothing was sent"
                     self._denial = CallError("refused", f"{text} (zenoh.access in its configuration)")
             self._asked_rights = True
         if self._denial is not None:

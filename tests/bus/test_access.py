@@ -18,6 +18,7 @@ from secure_lab import FORGED, REMOTE, SecureLab, Spy, program, until, zenoh_con
 
 from psiu_broker.broker import Broker
 from psiu_broker.bus.access import EVERYTHING, access_control
+from psiu_broker.bus.client import Client
 from psiu_broker.cli import tool
 from psiu_broker.config import ZenohConfiguration, load
 from psiu_broker.errors import CallError
@@ -359,6 +360,22 @@ async def test_the_tool_is_told_why_its_call_goes_nowhere(lab: SecureLab) -> Non
             with pytest.raises(CallError, match="broker base lets screen only listen; nothing was sent") as caught:
                 await asyncio.to_thread(tell, "MNERIM", "quantoscomandos")
             assert caught.value.code == "refused"
+
+
+async def test_the_tool_goes_by_the_rules_of_the_broker_that_it_is_at(tmp_path: Path) -> None:
+    lab = SecureLab(tmp_path, ("base", "hill"))
+    file = tmp_path / "hill.toml"
+    file.write_text(file.read_text().replace('["operator"]', "[]").replace('"screen"', '"screen", "operator"'))
+    lab.brokers[1] = Broker(load(file))
+    async with lab:
+        await until(lambda: [each.owner for each in lab.brokers[0].mesh_seen().robots] == ["hill"])
+        with lab.client("operator") as client:
+            await asyncio.to_thread(client.put_call, "MNERIM", "parafrente", CallRequest(parameters=[1]))
+            await until(lambda: lab.robot.position.x == 1)
+        refused = pytest.raises(CallError, match="broker hill lets operator only listen")
+        with Client(lab.endpoints[1:], tls=files(lab.keys, "operator")) as client, refused:
+            await asyncio.to_thread(client.put_call, "MNERIM", "parafrente", CallRequest(parameters=[1]))
+        assert lab.robot.position.x == 1
 
 
 async def twins(lab: SecureLab, cable: int) -> None:
