@@ -79,6 +79,13 @@ class FakeMonitor:
         return SimpleNamespace(action=action, device_node=node)
 
 
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It looks often."""
+    monkeypatch.setattr("psiu_adapters.serial.POLL_S", 0.05)
+
+
+@pytest.mark.usefixtures("soon")
 async def test_the_return_of_the_device_is_noticed(pty: Pty) -> None:
     pty.unplug()
     waiting = asyncio.create_task(pty.adapter.changed())
@@ -88,6 +95,7 @@ async def test_the_return_of_the_device_is_noticed(pty: Pty) -> None:
         await waiting
 
 
+@pytest.mark.usefixtures("soon")
 async def test_a_device_that_changed_hands_is_worth_another_try(pty: Pty) -> None:
     waiting = asyncio.create_task(pty.adapter.changed())
     await asyncio.sleep(0.01)
@@ -96,9 +104,10 @@ async def test_a_device_that_changed_hands_is_worth_another_try(pty: Pty) -> Non
         await waiting
 
 
+@pytest.mark.usefixtures("soon")
 async def test_a_device_that_stays_away_is_not_worth_another_try(tmp_path: Path) -> None:
     with pytest.raises(TimeoutError):
-        async with asyncio.timeout(1.3):
+        async with asyncio.timeout(0.3):
             await Serial(device=str(tmp_path / "nothing")).changed()
 
 
