@@ -202,6 +202,12 @@ def test_a_listener_s_call_ends_with_the_reason(ask: Run) -> None:
     assert json.loads(ask("operator", "call", "MNERIM", "x", "--json").stdout)["error"] == "unknown_robot"
 
 
+def test_a_listener_s_ping_ends_with_the_reason_and_is_no_loss(ask: Run) -> None:
+    result = ask("screen", "ping", "MNERIM", "--count", "3", "--every", "0.01")
+    assert (result.exit_code, result.stdout) == (3, "")
+    assert "broker base lets screen only listen; nothing was sent" in result.stderr
+
+
 def test_a_name_without_any_right_is_told_so(ask: Run, daemon: Run, made: Path) -> None:
     daemon("keys", str(made / "keys"), "--program", "stranger", "--renew")
     result = ask("stranger", "status")
@@ -209,7 +215,10 @@ def test_a_name_without_any_right_is_told_so(ask: Run, daemon: Run, made: Path) 
     assert "lets stranger know; see its [zenoh.access]" in result.stderr
 
 
-def test_keys_of_another_laboratory_do_not_open(daemon: Run, secure: tuple[Any, str], tmp_path: Path) -> None:
+def test_keys_of_another_laboratory_do_not_open(
+    daemon: Run, secure: tuple[Any, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("psiu_broker.bus.client.OPEN_TIMEOUT_S", 0.5)
     daemon("keys", str(tmp_path), "--program", "operator")
     words = ("status", "--connect", secure[1], "--keys", f"{tmp_path}/operator")
     result = CliRunner().invoke(psiu, words, prog_name="psiu")
@@ -238,7 +247,10 @@ def test_keys_that_are_missing_or_open_to_others_are_refused(ask: Run, made: Pat
     assert "operator.key may be read by others, who could pass for its owner; run: chmod 6" in opened.stderr
 
 
-def test_with_keys_the_tool_looks_for_the_broker_of_this_computer(tool: Run, made: Path, secure: Any) -> None:
+def test_with_keys_the_tool_looks_for_the_broker_of_this_computer(
+    tool: Run, made: Path, secure: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("psiu_broker.bus.client.OPEN_TIMEOUT_S", 0.3)
     result = tool("status", "--keys", f"{made}/keys/operator", env={"PSIU_CONNECT": None})
     assert "tls/127.0.0.1:7447" in result.output or result.exit_code == 0
 
