@@ -278,7 +278,7 @@ async def test_a_body_without_room_says_so(tmp_path: Path) -> None:
 async def test_a_killed_tool_leaves_a_whole_script(tmp_path: Path) -> None:
     async with lab(tmp_path) as made:
         process = await made.start("upload", "MITYA", "3", made.file(LONG))
-        await made.recorded(5)
+        await made.recorded(2)
         process.kill()
         await process.communicate()
         await made.until(lambda: made.body.recording is None)
@@ -288,7 +288,7 @@ async def test_a_killed_tool_leaves_a_whole_script(tmp_path: Path) -> None:
 async def test_ctrl_c_ends_the_recording_and_empties_the_slot(tmp_path: Path) -> None:
     async with lab(tmp_path) as made:
         process = await made.start("upload", "MITYA", "3", made.file(LONG))
-        await made.recorded(5)
+        await made.recorded(2)
         process.send_signal(signal.SIGINT)
         _, errors = await process.communicate()
         assert (process.returncode, b"the recording was ended" in errors) == (130, True), errors
@@ -299,7 +299,7 @@ async def test_after_a_cut_link_the_recording_is_ended_as_soon_as_it_is_back(tmp
     async with lab(tmp_path) as made:
         file = made.file(LONG)
         upload = asyncio.create_task(made.run("upload", "MITYA", "3", file))
-        await made.recorded(5)
+        await made.recorded(2)
         made.port.unplug()
         told = await upload
         assert told.exit_code == 3
@@ -316,7 +316,7 @@ async def test_after_a_cut_link_the_recording_is_ended_as_soon_as_it_is_back(tmp
 async def test_a_broker_that_stops_ends_the_recording(tmp_path: Path) -> None:
     async with lab(tmp_path) as made:
         upload = asyncio.create_task(made.run("upload", "MITYA", "3", made.file(LONG)))
-        await made.recorded(5)
+        await made.recorded(2)
         await made.broker.stop()
         assert (await upload).exit_code == 3
         await made.until(lambda: made.body.recording is None)
@@ -327,7 +327,7 @@ async def test_a_stop_ends_the_recording_and_stops_the_robot(tmp_path: Path) -> 
     async with lab(tmp_path) as made:
         await made.call("drive", 50)
         upload = asyncio.create_task(made.run("upload", "MITYA", "3", made.file(LONG)))
-        await made.recorded(5)
+        await made.recorded(2)
         assert made.body.body.left == 50
         await made.call("stop")
         assert made.body.body.left == 0
@@ -356,7 +356,7 @@ async def test_a_stop_ends_the_script_that_the_robot_plays(tmp_path: Path, versi
 async def test_nothing_else_reaches_a_robot_that_records(tmp_path: Path) -> None:
     async with lab(tmp_path) as made:
         upload = asyncio.create_task(made.run("upload", "MITYA", "3", made.file(LONG)))
-        await made.recorded(5)
+        await made.recorded(2)
         with pytest.raises(CallError, match="MITYA is at roboscript-upload and hears nothing else"):
             await made.broker.call(Address.named("MITYA"), "drive", CallRequest(parameters=[9], timeout_s=0.1))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as panel:
