@@ -18,7 +18,7 @@ from psiu_broker.frame import Address
 from psiu_broker.messages import CallRequest, Card
 from psiu_broker.protocols import PROTOCOLS
 
-_UNASKED: Final[frozenset[CallCode]] = frozenset({"bad_request", "unknown_command"})
+_UNASKED: Final[frozenset[CallCode]] = frozenset({"bad_request", "unknown_command", "refused"})
 """Reasons that will not pass."""
 
 
