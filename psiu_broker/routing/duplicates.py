@@ -72,6 +72,11 @@ class Duplicates:
         seen = self._new.get(key) or self._old.get(key)
         return seen is not None and self._is_another(seen, way, now, subject)
 
+    def withdraw(self, key: Hashable) -> None:
+        """The frame `key`, noted just now, was turned away: what comes next with its bytes is no double of it."""
+        self._new.pop(key, None)
+        self._old.pop(key, None)
+
     def heard_here(self, key: Hashable, since: float) -> bool:
         """Whether a link of ours, and not only another broker, brought the frame `key` at `since` or later."""
         seen = self._new.get(key) or self._old.get(key)

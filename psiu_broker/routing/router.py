@@ -170,15 +170,15 @@ class Router:
             self.books.arrived(frame.source)
             wrong = self._learn(frame, source, arrived, now)
             if wrong is not None:
-                return self._turn_away(frame, wrong, arrived, now)
+                return self._turn_away_noted(frame, wrong, arrived, now)
         target = routes.get(frame.destination)
         if target is not None and target.protocol == frame.protocol and target.way != arrived:
             ready: Decision | None = target.decision
             if ready is not None:
                 return ready
         elif target is None and self._is_storm(frame, arrived, now):
-            return self._turn_away(frame, STORM, arrived, now)
-        return self.decide(frame.destination, frame.protocol, arrived)
+            return self._turn_away_noted(frame, STORM, arrived, now)
+        return self._decide_noted(frame, arrived)
 
     def sent(self, frame: Frame, now: float) -> None:
         """A frame of our own leaves without being routed: what comes round of it is a double."""
@@ -333,6 +333,19 @@ class Router:
         if self._duplicates.knows(self._identity(frame), arrived, now, frame.subject):
             return DOUBLE  # overheard, or come round
         return self._turn_away(frame, verdict, arrived, now)
+
+    # What went nowhere must not make a double of what comes next with its bytes. Of what robots say to each other on
+    # one radio that is left as it is, or another radio's copy would move the robot twice; a stop harms nobody twice.
+
+    def _turn_away_noted(self, frame: Frame, verdict: Verdict, arrived: Way, now: float) -> Decision:
+        self._duplicates.withdraw(self._identity(frame))
+        return self._turn_away(frame, verdict, arrived, now)
+
+    def _decide_noted(self, frame: Frame, arrived: Way) -> Decision:
+        decision = self.decide(frame.destination, frame.protocol, arrived)
+        if decision.action == "drop" and lane(frame) == STOP_LANE:
+            self._duplicates.withdraw(self._identity(frame))
+        return decision
 
     def _turn_away(
         self, frame: Frame, verdict: Verdict, arrived: Way, now: float, rule: Rule | None = None

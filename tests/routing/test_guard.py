@@ -314,6 +314,29 @@ def test_what_is_remembered_of_those_who_stop_everyone_has_an_end() -> None:
     assert len(guard._stopping) == STOPPING_KEPT
 
 
+def test_whoever_imitates_a_stop_where_it_goes_nowhere_does_not_make_a_double_of_the_true_one(router: Router) -> None:
+    router.route(text(GAMA, BASE), HERS, 0.0)
+    assert router.route(text(PC, MNERIM, "pare"), RADIO, 1.0).verdict == "same_way"
+    assert router.route(text(PC, MNERIM, "pare"), CABLE, 1.5).action == "forward"
+    assert router.route(text(PC, MNERIM, "pare"), HERS, 1.6).verdict == "duplicate"
+
+
+def test_a_frame_that_two_radios_heard_goes_out_once_where_its_robot_heard_it_itself(router: Router) -> None:
+    assert router.route(text(PC, MNERIM, "parafrente"), RADIO, 1.0).verdict == "same_way"
+    assert router.route(text(PC, MNERIM, "parafrente"), CABLE, 1.5).verdict == "duplicate"
+
+
+def test_what_was_one_too_many_makes_no_double_of_what_comes_by_another_link() -> None:
+    router = made(per_minute=1)
+    router.route(text(Address.named("EVIL"), BASE), CABLE, 9.0)
+    assert router.route(text(PC, MNERIM), CABLE, 10.0).verdict == "too_many_names"
+    assert router.route(text(PC, MNERIM), HERS, 10.1).action == "forward"
+    for number in range(TO_EVERYONE_AT_ONCE):
+        router.route(question(number), HERS, 11.0)
+    assert router.route(question(1000), HERS, 11.0).verdict == "storm"
+    assert router.route(question(1000), CABLE, 11.1).action == "flood"
+
+
 def test_a_storm_keeps_no_frame_for_one_robot_back(router: Router) -> None:
     for number in range(3 * TO_EVERYONE_AT_ONCE):
         router.route(question(number), CABLE, 10.0)
