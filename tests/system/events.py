@@ -117,10 +117,15 @@ KINDS: Final[tuple[Draw, ...]] = (killed, killed, restarted, stopped, pulled, si
 """Killed twice: at once and after a while are two different things."""
 
 
-def drawn(count: int, chance: random.Random) -> Sequence[Draw]:
-    """`count` kinds of events; of the first few there is each kind once before one comes again."""
-    first = chance.sample(KINDS, len(KINDS))
-    return [*first, *chance.choices(KINDS, k=max(0, count - len(first)))][:count]
+def drawn(count: int, network: int, seed: int) -> Sequence[Draw]:
+    """`count` kinds of events for one of several networks; of the first few there is each kind once.
+
+    The networks begin `count` kinds apart, so that a few in each are many kinds in all.
+    """
+    first = random.Random(seed).sample(KINDS, len(KINDS))
+    begin = network * count % len(first)
+    more = random.Random(f"{seed}/{network}").choices(KINDS, k=max(0, count - len(first)))
+    return [*first[begin:], *first[:begin], *more][:count]
 
 
 def _later(do: Callable[..., object], *arguments: object) -> Callable[[], Awaitable[None]]:
