@@ -35,6 +35,8 @@ class End(Port):
     robot: AsciiRobot
     wrong: Callable[[bytes], bytes] | None = None
     """What becomes of all bytes, both ways."""
+    longest_piece = 0
+    """Bytes that left at once."""
 
     @property
     @abstractmethod
@@ -60,6 +62,7 @@ class End(Port):
         super()._deliver(data if self.wrong is None else self.wrong(data), peer)
 
     def _leave(self, data: bytes, peer: object) -> None:
+        self.longest_piece = max(self.longest_piece, len(data))
         super()._leave(data if self.wrong is None else self.wrong(data), peer)
 
 

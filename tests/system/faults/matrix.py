@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final, NamedTuple
 
 from mocked_bluez import PAIRED, Bluetooth
-from system.faults.ends import ENDS, Kind, at_another_rate
+from system.faults.ends import ENDS, QUESTION, Kind, at_another_rate
 from system.faults.lab import Base, Lab, SteppedClock, fill
 
 from psiu_broker.messages import CallRequest
@@ -33,11 +33,8 @@ class Trouble(NamedTuple):
     """Where the link is by Bluetooth."""
     clock: SteppedClock | None
 
-    async def is_open(self) -> bool:
-        return await self.lab.state() == "open"
-
     async def is_waiting(self) -> bool:
-        return await self.lab.state() in ("waiting", "opening")
+        return (await self.lab.link())["state"] in ("waiting", "opening")
 
 
 async def absent_at_start(trouble: Trouble) -> float:
@@ -49,10 +46,19 @@ async def absent_at_start(trouble: Trouble) -> float:
 
 
 async def vanishes_mid_frame(trouble: Trouble) -> float:
-    end = trouble.lab.end
-    end.say(HALF)
+    """Half a frame has arrived: behind a whole one, which is seen."""
+    end, lab = trouble.lab.end, trouble.lab
+    before = (await lab.link())["frames_in"]
+    end.say(end.robot.say("base", QUESTION, 1) + HALF)
+
+    async def read() -> bool:
+        return (await lab.link())["frames_in"] > before
+
+    await lab.until(read)
     end.unplug()
     await asyncio.sleep(1.0)
+    if not isinstance(end, ENDS["udp"]):
+        assert await trouble.is_waiting()
     end.plug()
     return time.monotonic()
 
@@ -88,34 +94,47 @@ async def garbage_flood(trouble: Trouble) -> float:
         for _ in range(8):
             end.say(luck.randbytes(DATAGRAM))
         await asyncio.sleep(0)
-    (link,) = (each for each in await trouble.lab.base.ask("links") if each["name"] == "trouble")
-    assert link["malformed"] > 100
+    assert (await trouble.lab.link())["malformed"] > 100
     return time.monotonic()
 
 
 async def wrong_baud(trouble: Trouble) -> float:
-    end = trouble.lab.end
+    end, lab = trouble.lab.end, trouble.lab
     end.wrong = at_another_rate
     for turn in range(100):
-        end.send(end.robot.say("base", "distancia", turn))
+        if turn == 50:  # what was on its way has arrived
+            before = await lab.link()
+        end.send(end.robot.say("base", QUESTION, turn))
         await asyncio.sleep(0.02)
+    link = await lab.link()
+    assert link["frames_in"] == before["frames_in"], "nothing is understood"
+    assert link["malformed"] > before["malformed"]
     end.wrong = None
     return time.monotonic()
 
 
 async def flaps(trouble: Trouble) -> float:
     """Ten times a second, for three seconds."""
-    end = trouble.lab.end
+    end, lab = trouble.lab.end, trouble.lab
+    before = (await lab.link())["reopened"]
     for _ in range(30):
         end.unplug()
         await asyncio.sleep(0.05)
         end.plug()
         await asyncio.sleep(0.05)
-    return time.monotonic()
+    over = time.monotonic()
+
+    async def opened_again() -> bool:
+        return (await lab.link())["reopened"] > before
+
+    if not isinstance(end, ENDS["udp"]):
+        await lab.until(opened_again)
+    return over
 
 
 async def one_byte_at_a_time(trouble: Trouble) -> float:
     """It never stops: what is measured is one answer in such pieces."""
+    assert trouble.lab.end.longest_piece == 1
     return time.monotonic()
 
 
@@ -189,7 +208,7 @@ async def stands_still(trouble: Trouble) -> float:
 
 
 async def no_descriptors(trouble: Trouble) -> float:
-    """The link goes while no more file can be opened, and programs knock in vain."""
+    """The link goes while no more file can be opened, and programs knock in vain; a UDP link stays: it opens none."""
     lab = trouble.lab
     pid = lab.base.process.pid
     _, hard = before = resource.prlimit(pid, resource.RLIMIT_NOFILE)

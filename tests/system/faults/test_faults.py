@@ -5,6 +5,7 @@
 
 import contextlib
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,14 +14,16 @@ from typing import Final
 
 import pytest
 from mocked_bluez import MISSING, PAIRED, mocked
+from system.faults.conftest import table
 from system.faults.ends import ENDS, Kind, at_another_rate
 from system.faults.lab import Lab, SteppedClock, small_disk
 from system.faults.matrix import ROWS, Row, Trouble, absent_at_start, clock_steps, disk_full
 
+TREE: Final = Path(__file__).parents[3]
 ALL: Final = bool(os.environ.get("PSIU_FAULTS"))
 
 pytestmark = [
-    pytest.mark.timeout(180),
+    pytest.mark.timeout(400),
     pytest.mark.skipif(sys.platform != "linux", reason="ptys, signals and limits as Linux has them"),
 ]
 
@@ -68,6 +71,19 @@ async def test_after_a_fault_all_is_as_before(
 def test_each_row_says_what_it_cannot_befall() -> None:
     assert all(bool(row.why_not) == (len(row.kinds) < len(ENDS)) for row in ROWS)
     assert all(set(row.usual) <= set(row.kinds) for row in ROWS)
+
+
+@pytest.mark.parametrize("name", ["README.md", "README.pt-BR.md"])
+def test_the_table_of_the_readme_is_the_one_that_is_printed(name: str) -> None:
+    told = re.search(r"<!-- faults -->\n\n```text\n(.*?)\n```", (TREE / name).read_text(), re.DOTALL)
+    assert told is not None
+    assert in_kind(told[1]) == in_kind(table())
+    assert "?" not in told[1], "a fault was not measured"
+
+
+def in_kind(table: str) -> str:
+    """A table whatever was measured, and where."""
+    return re.sub(r"(?m)^\d+ processors, load \d+", "# processors", re.sub(r" +(?:\d+\.\d\d|\?)(?=\s|$)", " #", table))
 
 
 def test_a_wrong_rate_leaves_nothing_to_read() -> None:
