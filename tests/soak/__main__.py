@@ -18,7 +18,8 @@ from psiu_broker.bus.client import Client
 from psiu_broker.errors import PsiuError
 from psiu_broker.messages import Ledger, Status
 from psiu_broker.simulator import Simulation
-from tests.soak.figures import Rest, Trend, Usage, complaints, look
+from tests.soak import watched
+from tests.soak.figures import SHARP_S, Growth, Rest, Usage, complaints, growths, look
 from tests.soak.lab import Lab
 from tests.soak.load import Caller, Trouble
 
@@ -48,6 +49,7 @@ class _Soak:
         self._endpoint = f"tcp/127.0.0.1:{bus}"
         self._file = folder / "soak.toml"
         self._file.write_text(self._lab.text)
+        self._in_use = folder / "in-use"
         self._log = log or folder / "broker.log"
         self._load_s = load_s
         self._seed = seed
@@ -59,7 +61,7 @@ class _Soak:
     async def run(self) -> int:
         print(f"{self._lab.robots} robots on {self._lab.links} links, {self._load_s / 60:g} min, seed {self._seed}")
         async with Simulation(*self._lab.ports):
-            with _broker(self._file, self._log) as self._process:
+            with _broker(self._file, self._in_use, self._log) as self._process:
                 await self._look_up()
                 with Client([self._endpoint]) as client, client.listening(f"{client.keys.prefix}/**", self._hear):
                     return await self._measure()
@@ -71,9 +73,9 @@ class _Soak:
         caller.start()
         began = line_at = time.monotonic()
         print(f"{'s':>5} {'frames':>8} {'delivered':>9} {'dropped':>8} {'waiting':>7} {'told':>7} {'calls':>6}"
-              f" {'RSS MiB':>8} {'fd':>4} {'threads':>7} {'tasks':>5}  ledger")  # fmt: skip
+              f" {'RSS MiB':>8} {'in use':>7} {'fd':>4} {'threads':>7} {'tasks':>5}  ledger")  # fmt: skip
         while (passed_s := time.monotonic() - began) < self._load_s:
-            self._usages.append(look(self._process.pid, passed_s))
+            self._usages.append(look(self._process.pid, self._in_use, passed_s))
             if time.monotonic() >= line_at:
                 line_at += LINE_S
                 await self._line(caller, passed_s)
@@ -84,10 +86,10 @@ class _Soak:
         after = await self._rest()
         await self._look_up()
         warm_up_s = min(self._load_s * WARM_UP, WARM_UP_MAX_S)
-        trend = Trend.of([each for each in self._usages if each.at_s >= warm_up_s])
-        return self._tell(before, after, trend, trouble, caller)
+        grown = growths([each for each in self._usages if each.at_s >= warm_up_s])
+        return self._tell(before, after, grown, trouble, caller)
 
-    def _tell(self, before: Rest, after: Rest, trend: Trend, trouble: Trouble, caller: Caller) -> int:
+    def _tell(self, before: Rest, after: Rest, grown: tuple[Growth, Growth], trouble: Trouble, caller: Caller) -> int:
         total = self._ledger.total
         dropped = sum(total.dropped.values())
         print(f"frames       {total.arrived} = {total.delivered} delivered + {total.answered} answered"
@@ -96,12 +98,15 @@ class _Soak:
         print(f"ledger       {'balanced at every look' if not self._unbalanced else f'OFF {self._unbalanced} times'}")
         print(f"calls        {_counts(caller.outcomes)}")
         print(f"faults       {_counts(trouble.done)}, and on every line 2 % lost, 2 % damaged, 1 % doubled")
-        print(f"memory       {self._usages[0].rss_mib:.1f} → {self._usages[-1].rss_mib:.1f} MiB;"
-              f" {trend.mib_per_h:+.1f} MiB/h in the last {trend.measured_s:.0f} s:"
-              f" {trend.grown_mib:+.2f} MiB, {trend.allowed_mib:.2f} MiB is the most")  # fmt: skip
+        for each in grown:
+            print(f"{each.what:<12} {each.trend.mib_per_h:+.2f} MiB/h in the last {each.trend.measured_s:.0f} s:"
+                  f" {each.grown_mib:+.2f} MiB, {each.most_mib:.2f} MiB is the most")  # fmt: skip
+        in_use, _ = grown
+        more = "" if in_use.trend.measured_s >= SHARP_S else "; with MINUTES=10 also a smaller one"
+        print(f"leaks        one of {in_use.seen_kb_per_s:.1f} kB/s would be seen{more}")
         for what in Rest._fields:
             print(f"{what:<12} {getattr(before, what)} before, {getattr(after, what)} after")
-        found = complaints(before, after, trend, self._unbalanced, total.arrived)
+        found = complaints(before, after, grown, self._unbalanced, total.arrived)
         for complaint in found:
             print(f"NOT GOOD: {complaint}")
         if not found:
@@ -113,7 +118,7 @@ class _Soak:
         total, usage = self._ledger.total, self._usages[-1]
         print(f"{passed_s:5.0f} {total.arrived:8} {total.delivered:9} {sum(total.dropped.values()):8}"
               f" {total.waiting:7} {self._told:7} {caller.outcomes.total():6}"
-              f" {usage.rss_mib:8.1f} {usage.descriptors:4} {usage.threads:7} {status.tasks:5}"
+              f" {usage.rss_mib:8.1f} {usage.in_use_mib:7.2f} {usage.descriptors:4} {usage.threads:7} {status.tasks:5}"
               f"  {'balances' if self._ledger.balances else 'OFF'}", flush=True)  # fmt: skip
 
     async def _look_up(self) -> Status:
@@ -150,7 +155,7 @@ class _Soak:
             await asyncio.sleep(0.2)
         await asyncio.sleep(5.0)
         status = await self._look_up()
-        usage = look(self._process.pid, 0.0)
+        usage = look(self._process.pid, self._in_use, 0.0)
         return Rest(usage.descriptors, usage.threads, status.tasks)
 
     def _hear(self, payload: bytes) -> None:
@@ -158,15 +163,15 @@ class _Soak:
 
 
 @contextmanager
-def _broker(file: Path, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
-    command: list[Any] = [Path(sys.executable).with_name("psiu-broker"), "run", "--config", file]
+def _broker(file: Path, in_use: Path, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    command: list[Any] = [sys.executable, watched.__file__, in_use, "run", "--config", file]
     with log.open("wb") as output:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            env={**os.environ, "TMPDIR": str(file.parent)},
+            env={**os.environ, "TMPDIR": str(file.parent), **watched.EXACT},
         )
     try:
         yield process

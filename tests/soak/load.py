@@ -14,6 +14,7 @@ from psiu_broker.messages import CallRequest
 from psiu_broker.simulator import Port, PtyPort
 from tests.soak.lab import Lab
 
+HELLO_EVERY_S: Final = 0.5
 ORDER_EVERY_S: Final = 0.05
 ORDERS_EACH: Final = 3
 LOST_ROBOT: Final = 0.02
@@ -69,7 +70,6 @@ class Trouble:
         self.done: Counter[str] = Counter()
         self._lab = lab
         self._random = random.Random(seed)
-        # Few pairs: the bus keeps something ready for each of the last 1024.
         self._orders = {
             robot.name: self._random.sample([call for call in lab.calls if call.robot != robot.name], ORDERS_EACH)
             for _, robot in lab.speakers
@@ -88,7 +88,10 @@ class Trouble:
             _plug(port)
 
     async def _order(self) -> None:
-        """Every pair once, so that the broker is warm soon; then at random."""
+        """Everybody asks who is there, and every pair talks once, so that the broker is warm soon; then at random."""
+        for port, robot in self._lab.speakers:
+            port.send(robot.hello(), robot)
+            await asyncio.sleep(HELLO_EVERY_S)
         pairs = [(port, robot, call) for port, robot in self._lab.speakers for call in self._orders[robot.name]]
         for port, robot, call in chain(pairs, iter(lambda: self._random.choice(pairs), None)):
             if self._random.random() < LOST_ROBOT:
