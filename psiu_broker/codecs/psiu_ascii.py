@@ -71,6 +71,11 @@ class _Checksums(dict[int, bytes]):
 _CHECKSUMS: Final = _Checksums()
 _PRINTABLE_BYTES: Final = bytes(range(0x20, 0x7F))
 
+_SHORTEST: Final = 9
+"""No frame of any version has fewer bytes: a name, the digits of the size, and those of the checksum."""
+_ENDED: Final = re.compile(rb"[^ -~\r\n]")
+"""What ends a run, and no line."""
+
 _STEP: Final = 1024
 _MOST_WORDS: Final = 1024
 """Names, and command words, that are remembered as text."""
@@ -153,6 +158,9 @@ class PsiuAscii(Codec):
         rest = 0 if self.pending else self._take_whole(data, events)
         for piece in _PIECE.finditer(data, rest):
             if piece[1] is not None:
+                if piece.end() - piece.start() < _SHORTEST and not self._run.text and _ENDED.match(data, piece.end()):
+                    self._waste(piece[1], events)
+                    continue
                 for at in range(piece.start(), piece.end(), _STEP):
                     self._read(data[at : min(at + _STEP, piece.end())], events)
             elif piece[2] is not None:
