@@ -41,9 +41,11 @@ def secure(made: Path, process: type[Any], port: Callable[..., int]) -> Iterator
     file = made / "base.toml"
     file.write_text('[broker]\nname = "base"\n' + text.replace("listeners = []", 'listeners = ["screen"]'))
     broker = process("psiu-broker", "run", "--config", file)
-    broker.until("is ready")
-    yield broker, endpoint
-    broker.close()
+    try:
+        broker.until("is ready")
+        yield broker, endpoint
+    finally:
+        broker.close()
 
 
 @pytest.fixture
