@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from shlex import quote
 from typing import Final, Literal
 
 from psiu_broker.exchange import Exchange
@@ -175,7 +176,7 @@ class Report:
             brokers=[self._broker],
             since=self.moment(held.since),
             detail=f"{held.keeper} has the name, {links} is held back: rename that one, or let it in: "
-            f"psiu conflicts --release {held.robot} {sorted(held.links)[0]}",
+            f"psiu conflicts --release {quote(str(held.robot))} {sorted(held.links)[0]}",
             link=held.keeper,
             held_back=sorted(held.links),
             frames=held.frames,

@@ -12,6 +12,7 @@ from psiu_broker.link import Link
 from psiu_broker.messages import Why
 from psiu_broker.report import Report
 from psiu_broker.routing.policy import Policy, Rule
+from psiu_broker.routing.quarantine import TURNS
 from psiu_broker.routing.router import ANY, SELF, Port, Router
 from psiu_broker.routing.table import Binding
 
@@ -162,6 +163,15 @@ def test_routes_tell_of_the_robots_of_other_brokers(world: World) -> None:
         "BRACO": "static", "FAR": "mesh", "north": "mesh", "PC": "learned", "MNERIM": "learned",
     }  # fmt: skip
     assert (routes["FAR"].link, routes["FAR"].peer, routes["FAR"].expires_in_s) == (MESH, "north", None)
+
+
+def test_what_to_do_about_two_robots_of_one_name_can_be_typed_as_it_is_told(world: World) -> None:
+    robot = Address.named("ROBO; reboot")
+    for turn in range(2 * TURNS):
+        frame = Frame(robot, BASE, "oi", b"oi %d" % turn, "psiu-ascii")
+        world.router.route(frame, Way(("wifi", "radio")[turn % 2]), world.now)
+    (told,) = (world.report._held(held) for held in world.router.quarantine)
+    assert told.detail.endswith("psiu conflicts --release 'ROBO; reboot' radio")
 
 
 # Who may command whom.

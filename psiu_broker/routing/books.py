@@ -95,7 +95,10 @@ class Books:
         waiting = dict(self.waiting())
         counted: dict[int, int] = {}
         where: dict[int, Route] = {}
-        for route in {id(route): route for route in self._routes.values()}.values():
+        routes = {id(route): route for route in self._routes.values()}.values()
+        for route in routes:  # before anything is counted: two accounts may turn out to be one
+            self._join(route.addresses)
+        for route in routes:
             account = self._join(route.addresses)
             counted[id(account)] = counted.get(id(account), 0) + route.counted
             where.setdefault(id(account), route)

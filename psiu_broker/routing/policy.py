@@ -27,13 +27,24 @@ ANY: Final = ("*",)
 _Glob = Callable[[str], object] | None
 
 
+_NUMBER: Final = re.compile(r"((?:.*\.)?0x)([0-9A-Fa-f*?\[\]!-]+)", re.DOTALL)
+"""A PSIU HEXA address, or a glob for some."""
+
+
 def _glob(globs: Sequence[str], *, any_case: bool = False) -> _Glob:
-    """What tells whether one of `globs` fits a text; None where all do."""
+    """What tells whether one of `globs` fits a text, or is it; None where all do."""
     if "*" in globs:
         return None
     # ?? is everyone, and no glob for all names of two letters.
-    patterns = [re.escape(each) if each == str(EVERYONE) else translate(each) for each in globs]
+    patterns = [re.escape(each) for each in globs] + [translate(each) for each in globs if each != str(EVERYONE)]
     return re.compile("|".join(f"(?:{each})" for each in patterns), re.IGNORECASE if any_case else 0).fullmatch
+
+
+def _addresses(globs: Sequence[str]) -> Sequence[str]:
+    """`globs`, and how the numbers among them are told: 0x5 as 0x05, 0xA* as 0xa*."""
+    numbers = [match for each in globs if (match := _NUMBER.fullmatch(each))]
+    lower = [f"{match[1]}{match[2].lower()}" for match in numbers]
+    return (*globs, *lower, *(str(Address.parse(each)) for each in lower))
 
 
 def _any(glob: _Glob, texts: Iterable[str]) -> bool:
@@ -60,7 +71,12 @@ class Rule:
     _globs: tuple[_Glob, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        globs = (_glob(self.source), _glob(self.destination), _glob(self.command, any_case=True), _glob(self.link))
+        globs = (
+            _glob(_addresses(self.source)),
+            _glob(_addresses(self.destination)),
+            _glob(self.command, any_case=True),
+            _glob(self.link),
+        )
         object.__setattr__(self, "_globs", globs)
 
     def fits(self, source: Iterable[str], destination: Iterable[str], words: Iterable[str] | None, link: str) -> bool:

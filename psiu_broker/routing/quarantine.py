@@ -57,8 +57,6 @@ class Quarantine:
     def __init__(self, *, capacity: int = KEPT) -> None:
         self.held: dict[Address, Held] = {}
         """By robot; empty unless something is wrong."""
-        self.version = 0
-        """Grows whenever another link is held back, or one is released."""
         self._capacity = capacity
         self._roaming: dict[Address, _Roaming] = {}
 
@@ -72,7 +70,7 @@ class Quarantine:
 
     def turned_away(self, robot: Address, now: float) -> None:
         """Count a frame that is held back."""
-        held = self.held[robot]
+        held = self.held[robot] = self.held.pop(robot)
         held.frames += 1
         held.last = now
 
@@ -117,7 +115,6 @@ class Quarantine:
         if not held.links:
             del self.held[robot]
         self._remember(robot, _Roaming(link, chosen=True))
-        self.version += 1
         return True
 
     def _remember(self, robot: Address, roaming: _Roaming) -> None:
@@ -127,7 +124,6 @@ class Quarantine:
             del self._roaming[next(iter(self._roaming))]
 
     def _hold(self, robot: Address, keeper: str, link: str, now: float) -> None:
-        self.version += 1
         held = self.held.get(robot)
         if held is not None:
             held.keeper = keeper

@@ -6,6 +6,11 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
+from psiu_broker.bus.client import Client
+from psiu_broker.errors import CallError
+
 
 def test_each_answer_is_a_line_and_the_end_sums_them_up(lab: Any) -> None:
     asked = lab.run("ping", "MNERIM", "--count", "3", "--every", "0.5")
@@ -38,3 +43,16 @@ def test_it_goes_on_until_ctrl_c_and_then_sums_up(lab: Any, start: Callable[...,
     ping.signal(signal.SIGINT)
     assert ping.ended() == 0
     assert re.fullmatch(r"MNERIM: \d+ of \d+ answered, .*", ping.out[-1])
+
+
+def test_what_is_refused_is_asked_once(lab: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def call(_: Client, robot: str, *__: object) -> None:
+        asked.append(robot)
+        raise CallError("refused", "broker base lets screen only listen; nothing was sent")
+
+    monkeypatch.setattr(Client, "call", call)
+    refused = lab.run("ping", "MNERIM", "--count", "3", "--every", "0.01")
+    assert (refused.exit_code, asked) == (3, ["MNERIM"])
+    assert refused.stderr == "psiu: broker base lets screen only listen; nothing was sent\n"

@@ -107,3 +107,14 @@ def test_what_names_nobody_is_counted_as_well() -> None:
     books = Books({})
     books.nameless("malformed")
     assert list(books.told()) == [(None, None, 1, 0, {"malformed": 1}, 0)]
+
+
+def test_nothing_is_missed_in_the_moment_when_two_robots_turn_out_to_have_shared_a_number() -> None:
+    table, books = kept()
+    table.place((MNERIM, ARM), Way("@mesh", "hill"), "psiu-hexa", 0.0)
+    table.routes[MNERIM].frames += 1
+    table.withdraw(table.routes[MNERIM], 1.0)
+    hear(table, MNERIM, 5)
+    books.arrived(BETA)
+    table.place((BETA, ARM), Way("@mesh", "hill"), "psiu-hexa", 2.0)
+    assert sum(each.arrived for each in books.told()) == 1 + 5 + 1

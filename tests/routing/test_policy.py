@@ -192,6 +192,33 @@ def test_a_rule_tells_where_it_is_written_and_what_it_says() -> None:
     assert str(Rule(True, where="policy[0]")) == "policy[0] allows everything"
 
 
+@pytest.mark.parametrize(
+    ("glob", "address", "meant"),
+    [
+        ("0x5", Address.numbered(5), True),
+        ("0x05", Address.numbered(5), True),
+        ("0xAB", Address.numbered(0xAB), True),
+        ("0xA*", Address.numbered(0xAB), True),
+        ("red.0xB", Address.numbered(0xB, "red"), True),
+        ("red.0xB", Address.numbered(0xB), False),
+        ("0x5", Address.numbered(0x50), False),
+        ("0x5", Address.named("0x5"), True),
+        ("R[1]", Address.named("R[1]"), True),
+        ("R[1]", Address.named("R1"), True),
+        ("R[1]", Address.named("R2"), False),
+        ("Rx0xAB", Address.named("Rx0xab"), False),
+    ],
+)
+def test_whoever_is_written_in_a_rule_is_meant_however_a_number_is_written(
+    glob: str, address: Address, meant: bool
+) -> None:
+    for rule, frame in (
+        (deny(destination=glob), text(PC, address, "parafrente", "1")),
+        (deny(source=glob), text(address, PC, "parafrente", "1")),
+    ):
+        assert (policy(rule).denial(frame, RADIO) is not None) is meant
+
+
 NAMES = st.sampled_from(["PC", "MNERIM", "BRACO", "P*", "*", "M?ERIM", "??", "[PB]*"])
 GLOBS = st.lists(NAMES, min_size=1, max_size=2).map(tuple)
 WORDS = st.sampled_from(["parafrente", "para*", "*", "PARE", "node/*"])

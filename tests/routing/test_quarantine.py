@@ -106,18 +106,6 @@ def test_a_third_robot_is_held_back_beside_the_second() -> None:
     assert (held.keeper, held.links) == ("c", {"b"})
 
 
-def test_each_change_shows_in_the_version() -> None:
-    quarantine = Quarantine()
-    versions = [quarantine.version]
-    by_turns(air := Air(quarantine), "a", "b")
-    versions.append(quarantine.version)
-    air.heard("b", 50)
-    assert quarantine.version == versions[-1], "one more frame is no news"
-    quarantine.release(MNERIM, "b")
-    versions.append(quarantine.version)
-    assert versions == sorted(set(versions))
-
-
 @given(st.integers(1, 8), st.integers(0, 40))
 def test_memory_is_bounded(capacity: int, robots: int) -> None:
     quarantine = Quarantine(capacity=capacity)
@@ -212,3 +200,15 @@ def test_a_robot_on_two_radios_of_one_broker_is_one_robot() -> None:
         assert lab.router.route(frame, ways[0], float(turn)).action == "answer"
         assert lab.router.route(frame, ways[1], turn + 0.3).verdict == "duplicate"
     assert not lab.router.quarantine.held
+
+
+def test_of_too_many_who_are_held_back_the_one_that_is_quiet_for_longest_is_let_go() -> None:
+    quarantine = Quarantine(capacity=3)
+    names = [Address.named(name) for name in "ABCD"]
+    for number, name in enumerate(names):
+        air = Air(quarantine, name)
+        for turn in range(2 * TURNS):
+            air.heard("ab"[turn % 2], float(turn))
+        if number == 2:
+            quarantine.turned_away(names[0], 10.0)
+    assert [each.robot for each in quarantine] == [names[2], names[0], names[3]]
