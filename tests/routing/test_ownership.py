@@ -1,4 +1,4 @@
-"""Each decision by itself; what comes of them among several brokers is in tests/mesh/test_mesh.py."""
+"""Each decision by itself; what comes of them among several brokers is in tests/mesh/test_mesh_roaming.py."""
 
 import pytest
 
