@@ -9,6 +9,7 @@ length. Only a known name's size claims the bytes behind it.
 """
 
 import re
+from collections.abc import Collection
 from typing import Final
 
 from psiu_broker.codecs.ascii_run import COMPLAINT_TEXT, Fit, Run
@@ -35,11 +36,12 @@ class DraftRun(Run):
     def name_end(self, text: bytes | bytearray, start: int, end: int) -> int | None:
         """Where in the frame from `start` to `end` the destination ends and the size begins."""
         known = unknown = None
+        lengths = self._name_lengths()
         for size in _SIZE.finditer(text, start + 1, min(end, start + LONGEST_NAME + 3)):
             place = size.start()
             if text[place - 1] == _SPACE:
                 continue
-            is_known = self._is_known(text[start:place].decode("ascii", "replace"))
+            is_known = place - start in lengths and self._is_known(text[start:place].decode("ascii", "replace"))
             if int(size[1]) == end - start:
                 if is_known:
                     return place
@@ -51,12 +53,23 @@ class DraftRun(Run):
     def size_field(self, text: bytes | bytearray, edge: int = 0, begin: int = 1) -> re.Match[bytes] | None:
         """The first three digits, from `begin` on, behind a known name that begins at `edge` or later."""
         names = self._directory.all_names
+        lengths: Collection[int] = ()
         for size in _SIZE.finditer(text, begin):
+            lengths = lengths or self._name_lengths()
             end = size.start()
             before = text[max(edge, end - LONGEST_NAME) : end].decode("ascii", "replace")
-            if before.endswith(EVERYONE.name) or any(before[at:] in names for at in range(len(before))):
+            if before.endswith(EVERYONE.name) or any(
+                before[-length:] in names for length in lengths if length <= len(before)
+            ):
                 return size
         return None
+
+    def _name_lengths(self) -> Collection[int]:
+        """The lengths that known names have, or may have where there are so many names that all are worth a try."""
+        names = self._directory.all_names
+        if len(names) >= LONGEST_NAME:
+            return range(1, LONGEST_NAME + 1)
+        return {len(EVERYONE.name), *map(len, names)} - {0}
 
     def _is_known(self, name: str) -> bool:
         return name in self._directory.all_names or name == EVERYONE.name

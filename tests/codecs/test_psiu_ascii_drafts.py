@@ -283,6 +283,13 @@ def test_any_cut_of_the_bytes_gives_the_same_events(stream: tuple[str, bytes], c
 
 
 @given(stream=streams(), strict=st.booleans())
+def test_robots_that_are_not_spoken_of_change_nothing_however_many(stream: tuple[str, bytes], strict: bool) -> None:
+    chosen, data = stream
+    others = ["~" * size for size in range(1, LONGEST_NAME)]
+    assert read(draft(chosen, *NAMES, *others, strict=strict), data) == read(draft(chosen, strict=strict), data)
+
+
+@given(stream=streams(), strict=st.booleans())
 def test_every_event_holds_what_it_promises(stream: tuple[str, bytes], strict: bool) -> None:
     chosen, data = stream
     for event in read(draft(chosen, strict=strict), data):
