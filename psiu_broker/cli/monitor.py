@@ -62,7 +62,15 @@ def monitor(connection: Connection, key: str | None, raw: str | None) -> None:
 
 
 def message_line(key: str, message: Message) -> str:
-    """A message of the bus for a person, known by its fields."""
+    """A message of the bus for a person, known by its fields; as it came where these are not what they should be."""
+    with suppress(TypeError, ValueError, AttributeError, OverflowError, LookupError):
+        line = _line(message)
+        if line is not None:
+            return line
+    return printable(f"{key}  {message.get('text') or to_json(message).decode()}")
+
+
+def _line(message: Message) -> str | None:
     if "verdict" in message and "direction" in message:
         return raw_line(message)
     if "kind" in message and "source" in message:
@@ -71,7 +79,7 @@ def message_line(key: str, message: Message) -> str:
         return card_line(message)
     if "gone" in message:
         return gone_line(str(message["robot"]))
-    return printable(f"{key}  {message.get('text') or to_json(message).decode()}")
+    return None
 
 
 def read_message(payload: bytes) -> Message:

@@ -9,7 +9,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
+from psiu_broker.cli.monitor import message_line
 from psiu_broker.messages import Card, Decoded, RawFrame
 
 Start = Callable[..., Any]
@@ -115,3 +118,20 @@ def test_a_wrong_key_is_told_on_one_line(lab: Any) -> None:
     assert refused.exit_code == 3
     assert "not a key" in refused.stderr
     assert lab.run("monitor", "MNERIM", "--raw", "radio").exit_code == 2
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=4,
+)
+FIELDS = sorted({*Decoded.model_fields, *RawFrame.model_fields, *Card.model_fields, "gone"})
+
+
+@given(st.dictionaries(st.sampled_from(FIELDS), JSON))
+@example({"kind": "command", "source": "PC", "parameters": 5})
+@example({"kind": "node", "source": "PC", "command": "garra", "value": "wide"})
+@example({"link_state": "open", "commands": 3})
+@example({"kind": "command", "source": "PC", "received": "0001-01-01T00:00:00+14:00"})
+def test_whatever_anybody_puts_on_the_bus_is_one_line(message: dict[str, Any]) -> None:
+    assert len(message_line("psiu/PC/base/oi", message).splitlines()) == 1
