@@ -229,7 +229,9 @@ class Broker:
 
     def mesh_seen(self) -> MeshMessage:
         mode, bus = self.configuration.mesh.mode, self._bus
-        return self.report.mesh(self.mesh, mode, bus.session.zenoh_id if bus else "", bus.mesh.linked if bus else ())
+        if bus is None:
+            return self.report.mesh(self.mesh, mode)
+        return self.report.mesh(self.mesh, mode, bus.session.zenoh_id, bus.mesh.linked, bus.mesh.unreadable)
 
     def conflicts(self) -> Sequence[Conflict]:
         return self.report.conflicts(self.mesh)

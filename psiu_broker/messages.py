@@ -335,6 +335,9 @@ class Mesh(Message):
     robots: list[MeshRobot] = Field(default=[], description="all that are announced, its own among them")
     conflicts: list[Conflict] = []
     redeclared: int = Field(default=0, description="how often it announced everything again, to mend Zenoh's routes")
+    unreadable: int = Field(
+        default=0, description="what came from other brokers and is no beat, notice or announcement; frames: see Ledger"
+    )
 
 
 class TraceHop(Message):

@@ -122,7 +122,14 @@ class Report:
             for trunk in self._trunks
         ]
 
-    def mesh(self, mesh: Mesh, mode: Literal["peer", "router"], zenoh_id: str, linked: Collection[str]) -> MeshMessage:
+    def mesh(
+        self,
+        mesh: Mesh,
+        mode: Literal["peer", "router"],
+        zenoh_id: str = "",
+        linked: Collection[str] = (),
+        unreadable: int = 0,
+    ) -> MeshMessage:
         """The other brokers as `mesh` knows them; `linked` are the Zenoh ids that a link of ours leads to."""
         now = self._clock()
         robots = [
@@ -162,6 +169,7 @@ class Report:
             robots=sorted(robots, key=lambda robot: robot.robot),
             conflicts=self._mesh_conflicts(mesh, now),
             redeclared=mesh.declared_anew,
+            unreadable=unreadable,
         )
 
     def conflicts(self, mesh: Mesh) -> list[Conflict]:

@@ -22,7 +22,6 @@ from concurrent.futures import Executor
 from typing import Any, Final
 
 import zenoh
-from pydantic import ValidationError
 
 from psiu_broker.bus.hang_up import hang_up
 from psiu_broker.bus.keys import Keys, chunk, robot, robot_chunk, text
@@ -56,6 +55,8 @@ class ZenohMesh:
         """The Zenoh ids of those whom a link of ours leads to."""
         self.failures = 0
         """Puts that Zenoh refused."""
+        self._unreadable: dict[str, int] = {}
+        """By what it should have been; each is counted by one thread."""
         self._session = session
         self._own = own
         self._mesh = mesh
@@ -94,6 +95,20 @@ class ZenohMesh:
             """For the loop: what an earlier session still brings is nothing any more."""
             return lambda it: None if bus._closed else hear(it, time.monotonic())
 
+        def readable(what: str, sift: Callable[[zenoh.Sample], Any]) -> Callable[[zenoh.Sample], Any]:
+            bus._unreadable[what] = 0
+
+            def read(sample: zenoh.Sample) -> Any:
+                try:
+                    kept = sift(sample)
+                except ValueError as error:
+                    logger.debug("%s: %s", what, error)
+                    kept = None
+                bus._unreadable[what] += kept is None
+                return kept
+
+            return read
+
         await session.serve(
             subscribe(f"frame/{me}/*/*", RING),
             bus._frame,
@@ -101,12 +116,31 @@ class ZenohMesh:
             lambda it: mesh.frame_came(*it, time.monotonic()),
             name="mesh-frames",
         )
-        await session.serve(subscribe(f"notice/{me}", TALK_RING), _notice, told(mesh.notice_came), name="mesh-notices")
-        await session.serve(subscribe("beat/*", TALK_RING), _beat, told(mesh.beat_came), name="mesh-beats")
-        await session.serve(watch("broker/**"), bus._broker_token, told(lambda it, now: it(now)), name="mesh-brokers")
-        await session.serve(watch("robot/**"), bus._robot_token, told(lambda it, now: it(now)), name="mesh-robots")
+        await session.serve(
+            subscribe(f"notice/{me}", TALK_RING),
+            readable("notices", _notice),
+            told(mesh.notice_came),
+            name="mesh-notices",
+        )
+        await session.serve(
+            subscribe("beat/*", TALK_RING), readable("beats", _beat), told(mesh.beat_came), name="mesh-beats"
+        )
+        await session.serve(
+            watch("broker/**"),
+            readable("brokers", bus._broker_token),
+            told(lambda it, now: it(now)),
+            name="mesh-brokers",
+        )
+        await session.serve(
+            watch("robot/**"), readable("robots", bus._robot_token), told(lambda it, now: it(now)), name="mesh-robots"
+        )
         mesh.attach(bus, time.monotonic(), time.time_ns())
         return bus
+
+    @property
+    def unreadable(self) -> int:
+        """How much came from other brokers that is no beat, notice or announcement; frames are in the ledger."""
+        return sum(self._unreadable.values())
 
     # mesh.MeshBus
 
@@ -222,7 +256,7 @@ class ZenohMesh:
             f"/{chunk(claim.protocol)}/{chunk(claim.link)}/{claim.term}/{claim.quality}/{age}"
         )
 
-    # What arrives, in the readers' threads: None for what is not as it should be.
+    # What arrives, in the readers' threads: None, or a ValueError, for what is not as it should be.
 
     def _chunks(self, key: str, count: int) -> list[str] | None:
         """The chunks behind ``psiu/@mesh/{word}/``, if there are so many."""
@@ -313,17 +347,9 @@ def _number(chunk: str) -> Address:
     return address
 
 
-def _beat(sample: zenoh.Sample) -> Beat | None:
-    try:
-        return Beat.model_validate_json(sample.payload.to_bytes())
-    except ValidationError as error:
-        logger.debug("a beat that is none: %s", error)
-        return None
+def _beat(sample: zenoh.Sample) -> Beat:
+    return Beat.model_validate_json(sample.payload.to_bytes())
 
 
-def _notice(sample: zenoh.Sample) -> Notice | None:
-    try:
-        return Notice.model_validate_json(sample.payload.to_bytes())
-    except ValidationError as error:
-        logger.debug("a notice that is none: %s", error)
-        return None
+def _notice(sample: zenoh.Sample) -> Notice:
+    return Notice.model_validate_json(sample.payload.to_bytes())

@@ -77,6 +77,10 @@ def mesh(connection: Connection, file: str | None) -> None:
         _draw(composed(told), file)
     else:
         show_mesh(composed(told), drawn=on_terminal())
+        for each in told if on_terminal() else ():
+            if each.unreadable:
+                said = f"{each.broker}: {each.unreadable} beats, notices or announcements could not be read"
+                click.echo(styled(f"{said}: is another broker of another version?", fg="red"))
 
 
 def show_mesh(view: View, *, drawn: bool) -> None:

@@ -77,6 +77,28 @@ async def test_what_the_session_before_still_brings_is_counted(lab: Lab) -> None
     await lab.until({"refused": 1})
 
 
+async def test_what_brokers_say_that_cannot_be_read_is_counted_and_fills_no_log(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    for key in ("beat/hill", "notice/base"):
+        lab.session.put(f"psiu/@mesh/{key}", b"garbage")
+    tokens = [
+        lab.session.liveliness().declare_token(f"psiu/@mesh/{key}")
+        for key in (
+            "broker/hill/life/abc/0",
+            "broker/hill",
+            "robot/hill/1/MNERIM/-/psiu-ascii/wifi/9/99/1/0",
+            "robot/x",
+        )
+    ]
+    async with asyncio.timeout(10):
+        while lab.broker.mesh_seen().unreadable < 6:  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+    assert lab.broker.mesh_seen().unreadable == 6
+    assert not caplog.records
+    del tokens
+
+
 def test_a_frame_that_zenoh_refuses_has_not_left() -> None:
     def put(*_: object, **__: object) -> None:
         raise zenoh.ZError("the session is closed")
