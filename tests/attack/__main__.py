@@ -82,7 +82,8 @@ def _attack(name: str, seconds: int, *, keeping: bool) -> bool:
             flush=True,
         )
         if keeping:
-            keep(name, [*kept(name), *(file.read_bytes() for file in found.iterdir())])
+            inputs = [*kept(name), *(file.read_bytes() for file in found.iterdir())]
+            print(f"{name:12} {keep(name, inputs, TARGETS[name]):>10,} inputs kept", flush=True)
         return True
 
 

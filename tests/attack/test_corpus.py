@@ -7,11 +7,14 @@ from pathlib import Path
 
 import pytest
 from attack import __main__ as runner
+from attack import corpus
 from attack.corpus import kept
 from attack.targets import TARGETS
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from psiu_broker.codecs.checksums import byte_sum
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,6 +45,20 @@ def test_nor_does_what_is_like_it(target: str) -> None:
         TARGETS[target](bytes(data))
 
     told()
+
+
+def test_of_many_inputs_the_shortest_are_kept_that_reach_something_new(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(corpus, "FOLDER", tmp_path)
+
+    def tell(data: bytes) -> None:
+        for byte in data:
+            byte_sum(bytes((byte,)))
+
+    inputs = [b"", b"\1", b"\2", b"\1\1", b"\1\1\1", b"\1\1\1\1", b"\1\1\1\1\1"]
+    assert corpus.keep("x", inputs, tell) == 4
+    assert kept("x") == [b"\1", b"\1\1", b"\1\1\1", b"\1\1\1\1\1"]
 
 
 def test_what_broke_a_target_is_printed_whole_with_what_tells_it_again(
