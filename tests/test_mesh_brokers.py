@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from ports import free_port
 
 from psiu_broker.broker import Broker
 from psiu_broker.bus.client import Client
@@ -49,12 +50,6 @@ address = 0x12
 link = "arm"
 nodes.garra = {{ node = 4, type = "servo" }}
 """
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def until(true: Callable[[], object], timeout_s: float = 10.0) -> float:

@@ -5,6 +5,7 @@ import socket
 from pathlib import Path
 
 import pytest
+from ports import free_port
 
 from psiu_broker.bus.hang_up import hang_up
 from psiu_broker.bus.session import Session
@@ -57,9 +58,7 @@ def test_what_is_no_stream_is_left_alone(endpoint: str) -> None:
 
 
 async def test_zenoh_sessions_that_were_hung_up_on_find_each_other_again() -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     first = await Session.open([endpoint])
     second = await Session.open([], connect=[endpoint])
     try:

@@ -13,6 +13,7 @@ from typing import ClassVar
 import pytest
 from adapter_contract import AdapterContract, FarEnd
 from examples.unix_adapter import Unix
+from ports import free_port
 
 from psiu_broker.broker import Broker
 from psiu_broker.config import load
@@ -134,9 +135,7 @@ class _Listener:
 @pytest.fixture
 async def program(tmp_path: Path) -> AsyncIterator[_Listener]:
     """The example beside a broker with MNERIM on a pty."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     file = tmp_path / "lab.toml"
     async with PtyPort(AsciiRobot("MNERIM", answer_s=0.1), link=tmp_path / "radio") as radio:
         file.write_text(

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import zenoh
 from broker_process import BrokerProcess
+from ports import free_port
 from stream_relay import Relay
 
 from psiu_broker.broker import Broker
@@ -34,12 +35,6 @@ listen = "127.0.0.1:{wifi}"
 protocol = "psiu-ascii"
 """
 FORWARD = b"MNERIM 034 parafrente 100 PC 02123"
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def until(true: Callable[[], object], timeout_s: float = 10.0) -> None:
