@@ -67,6 +67,8 @@ def test_a_leak_of_a_kilobyte_a_second_is_seen_within_ten_minutes() -> None:
 def test_what_comes_and_goes_is_no_leak() -> None:
     flat = growths(used(lambda at_s: 0.0, 400))
     assert complaints(REST, REST, flat, 0, 1000) == []
+    lost = growths(used(lambda at_s: -0.7 * (60 < at_s < 200), 400))
+    assert complaints(REST, REST, lost, 0, 1000) == [], "a session that was lost, and came again"
     late = growths(used(lambda at_s: 3.0 * (350 < at_s < 360), 400))
     assert complaints(REST, REST, late, 0, 1000) == []
 

@@ -19,7 +19,7 @@ from psiu_broker.errors import PsiuError
 from psiu_broker.messages import Ledger, Status
 from psiu_broker.simulator import Simulation
 from tests.soak import watched
-from tests.soak.figures import SHARP_S, Growth, Rest, Usage, complaints, growths, look
+from tests.soak.figures import SHARP_S, Growth, Rest, Usage, complaints, growths, look, more_at_rest
 from tests.soak.lab import Lab
 from tests.soak.load import Caller, Trouble
 
@@ -83,7 +83,7 @@ class _Soak:
         await self._line(caller, passed_s)
         await trouble.end()
         await asyncio.to_thread(caller.end)
-        after = await self._rest()
+        after = await self._rest(before)
         await self._look_up()
         warm_up_s = min(self._load_s * WARM_UP, WARM_UP_MAX_S)
         grown = growths([each for each in self._usages if each.at_s >= warm_up_s])
@@ -142,8 +142,8 @@ class _Soak:
             time.sleep(0.1)
         raise click.ClickException(f"the broker does not answer:\n{self._log.read_text()}")
 
-    async def _rest(self) -> Rest:
-        """What the broker uses once every link is open.
+    async def _rest(self, before: Rest | None = None) -> Rest:
+        """What the broker uses once every link is open; waits, so long as that is more than `before`.
 
         Raises:
             click.ClickException: one does not open within `AT_REST_S`.
@@ -153,10 +153,13 @@ class _Soak:
             if time.monotonic() > until:
                 raise click.ClickException(f"{status.links_open} of {status.links} links are open, though all could be")
             await asyncio.sleep(0.2)
-        await asyncio.sleep(5.0)
-        status = await self._look_up()
-        usage = look(self._process.pid, self._in_use, 0.0)
-        return Rest(usage.descriptors, usage.threads, status.tasks)
+        while True:
+            await asyncio.sleep(5.0)
+            status = await self._look_up()
+            usage = look(self._process.pid, self._in_use, 0.0)
+            rest = Rest(usage.descriptors, usage.threads, status.tasks)
+            if before is None or not more_at_rest(before, rest) or time.monotonic() > until:
+                return rest
 
     def _hear(self, payload: bytes) -> None:
         self._told += 1

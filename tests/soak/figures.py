@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -35,7 +36,10 @@ def look(pid: int, in_use: Path, at_s: float) -> Usage:
 
 
 class Trend(NamedTuple):
-    """The line that fits best through the least of every `FLOOR_S`."""
+    """The line that fits best through the most, so far, of the least of every `FLOOR_S`.
+
+    A session that is lost, as happens where a machine has too much to do, gives back what is taken again later.
+    """
 
     mib_per_h: float
     measured_s: float
@@ -43,16 +47,17 @@ class Trend(NamedTuple):
     @classmethod
     def of(cls, points: Sequence[tuple[float, float]]) -> "Trend":
         """`points` are seconds and MiB."""
-        floors: dict[float, tuple[float, float]] = {}
+        floors: dict[float, float] = {}
         for at_s, mib in points:
             floor = at_s // FLOOR_S
-            floors[floor] = min((mib, at_s), floors.get(floor, (mib, at_s)))
+            floors[floor] = min(mib, floors.get(floor, mib))
         if len(floors) < 2:
             return cls(0.0, 0.0)
-        mean_mib, mean_s = (sum(values) / len(floors) for values in zip(*floors.values(), strict=True))
-        spread = sum((at_s - mean_s) ** 2 for _, at_s in floors.values())
-        slope = sum((at_s - mean_s) * (mib - mean_mib) for mib, at_s in floors.values()) / spread
-        return cls(slope * 3600, points[-1][0] - points[0][0])
+        most = list(accumulate(floors.values(), max))
+        mean, mean_mib = (sum(values) / len(most) for values in (floors, most))
+        spread = sum((floor - mean) ** 2 for floor in floors)
+        slope = sum((floor - mean) * (mib - mean_mib) for floor, mib in zip(floors, most, strict=True)) / spread
+        return cls(slope / FLOOR_S * 3600, points[-1][0] - points[0][0])
 
 
 class Bound(NamedTuple):
@@ -122,8 +127,13 @@ def complaints(before: Rest, after: Rest, grown: Sequence[Growth], unbalanced: i
         for each in grown
         if each.grown_mib > each.most_mib
     ]
-    for what in ("descriptors", "threads", "tasks"):
-        was, now = getattr(before, what), getattr(after, what)
-        if now > was + MORE_AT_REST:
-            found.append(f"{what} before: {was}, after: {now}")
-    return found
+    return found + more_at_rest(before, after)
+
+
+def more_at_rest(before: Rest, after: Rest) -> list[str]:
+    """What is in use `after`, and was not `before`, in words."""
+    return [
+        f"{what} before: {was}, after: {now}"
+        for what, was, now in zip(Rest._fields, before, after, strict=True)
+        if now > was + MORE_AT_REST
+    ]
