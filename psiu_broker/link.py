@@ -22,7 +22,7 @@ from psiu_broker.codecs.codec import Codec, Event
 from psiu_broker.config import LinkConfiguration, LinkOptions
 from psiu_broker.config.who import Ends
 from psiu_broker.errors import EncodeError
-from psiu_broker.frame import NOBODY, Address, Frame, Malformed, Way
+from psiu_broker.frame import MALFORMED_KEPT, NOBODY, Address, Frame, Malformed, Way
 from psiu_broker.kept import FIRST_PAUSE_S, Kept
 from psiu_broker.routing.askers import Askers
 from psiu_broker.routing.limits import Gate, Limits, Rate
@@ -30,6 +30,9 @@ from psiu_broker.routing.outbox import COMMAND_LANE, QUESTION_LANE, STOP_LANE, F
 from psiu_broker.routing.verdicts import DELIVERED, EXPIRED, LINK_DOWN, QUEUE_FULL, REFUSED, SUPERSEDED, Verdict
 
 WARNED_KEPT: Final = 256
+
+CUT_OFF: Final = "cut off: the connection ended"
+"""The reason of a `Malformed` that might have been heard, had the connection lasted."""
 
 log = logging.getLogger(__name__)
 
@@ -212,8 +215,7 @@ class Link(Kept):
             self._hub.settled(parcel.fate, LINK_DOWN, now)
         self._note_empty()
         if end is not None:
-            if end.timer is not None:
-                end.timer.cancel()
+            self._give_up(end, now)
             self._hub.peer_lost(end.way, now)
 
     def connected(self, transport: Transport) -> None:
@@ -366,9 +368,10 @@ class Link(Kept):
 
     def _take(self, events: Sequence[Event], way: Way, now: float) -> None:
         ends = self._ends
-        for event in events:
+        for place, event in enumerate(events):
             if self._ends is not ends:
-                return  # The link went down at an earlier frame; the rest must not teach routes to it.
+                self._cut_off(events[place:], way, now)  # by an earlier frame; the rest must not teach routes to it
+                return
             if isinstance(event, Frame):
                 self.frames_in += 1
                 self.last_heard = now
@@ -376,6 +379,19 @@ class Link(Kept):
             else:
                 self.malformed += 1
                 self._hub.malformed(event, way, now)
+
+    def _give_up(self, end: _End, now: float) -> None:
+        if end.timer is not None:
+            end.timer.cancel()
+        if end.codec.pending:
+            self._cut_off(end.codec.flush(now), end.way, now)
+
+    def _cut_off(self, events: Sequence[Event], way: Way, now: float) -> None:
+        """Count what the end of the connection left unfinished or unheard."""
+        for event in events:
+            size = len(event.wire) if isinstance(event, Frame) else event.size
+            self.malformed += 1
+            self._hub.malformed(Malformed(CUT_OFF, event.wire[:MALFORMED_KEPT], size), way, now)
 
     def _addressed(self, frame: Frame, way: Way, now: float) -> Frame:
         """`frame` of a link whose packets do not say for whom they are: for who asked last, if anybody did."""
@@ -436,10 +452,9 @@ class Link(Kept):
         now = self._clock()
         self._transport = None
         self._set_state("waiting", reason)
-        for end in self._ends.values():
-            if end.timer is not None:
-                end.timer.cancel()
-        self._ends = {}
+        ends, self._ends = self._ends.values(), {}
+        for end in ends:
+            self._give_up(end, now)
         if self.adapter.datagrams:
             self.codec = self._make_codec()
         self._opening.cancel()

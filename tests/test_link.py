@@ -11,7 +11,7 @@ from psiu_broker import link as link_module
 from psiu_broker.codecs import psiu_ascii, psiu_hexa
 from psiu_broker.errors import LinkLost
 from psiu_broker.frame import EVERYONE, Address, Frame, Malformed, Way
-from psiu_broker.link import Link
+from psiu_broker.link import CUT_OFF, Link
 from psiu_broker.routing.outbox import Fate
 
 PC, MNERIM = Address.named("PC"), Address.named("MNERIM")
@@ -329,6 +329,24 @@ async def test_what_comes_behind_the_frame_that_ended_the_link_is_not_heard(hub:
     hub.heard = lambda frame, way, now: hub.frames.append((frame, way)) or link.lost(LinkLost("gone"))  # type: ignore[func-returns-value, method-assign]
     link.received(COMMAND + COMMAND, None)
     assert len(hub.frames) == 1
+    assert hub.noise == [Malformed(CUT_OFF, COMMAND, len(COMMAND))]
+
+
+@pytest.mark.parametrize("begun", [COMMAND[:10], COMMAND[:-1]])
+async def test_half_a_frame_counts_when_the_link_goes_down_in_its_midst(hub: Hub, begun: bytes) -> None:
+    link = connected(hub, MemoryTransport())
+    link.received(begun, None)
+    link.lost(LinkLost("gone"))
+    assert hub.noise == [Malformed(CUT_OFF, begun, len(begun))]
+    assert link.malformed == 1
+    assert not hub.frames
+
+
+async def test_half_a_frame_counts_when_its_sender_leaves(hub: Hub) -> None:
+    link = connected(hub, MemoryTransport())
+    link.received(COMMAND[:10], "a")
+    link.peer_lost("a")
+    assert hub.noise == [Malformed(CUT_OFF, COMMAND[:10], 10)]
 
 
 async def test_an_answer_without_a_destination_is_for_whom_the_robot_was_last_addressed_by(hub: Hub) -> None:
