@@ -46,8 +46,10 @@ class BrokerProcess:
                         pass
                 yield process
             finally:
-                with contextlib.suppress(ProcessLookupError):
-                    process.terminate()
+                # Not process.terminate(), which may notice before asyncio that it has died; how would be lost then.
+                if process.returncode is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(process.pid, signal.SIGTERM)
                 await process.communicate()
             assert process.returncode in (0, -signal.SIGKILL)
             assert process.returncode or os.listdir(temporary) == [], "it leaves nothing behind"  # noqa: PTH208
