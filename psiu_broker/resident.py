@@ -39,7 +39,7 @@ NAME_WITHIN_S: Final = 2.0
 NAK_EVERY_S: Final = 0.1
 TASKS_KEPT: Final = 64
 STOPS_KEPT: Final = 8
-"""Of one robot, besides."""
+"""How many stops of one robot, besides, may wait for their answers; of any more the answers are not waited for."""
 _TALKING: Final = frozenset({psiu_ascii.PROTOCOL, psiu_hexa.PROTOCOL})
 """The protocols in which the broker is a robot among others, with a name or a number of its own."""
 
@@ -109,7 +109,9 @@ class Resident:
         if told is not None:
             self._exchange.send(told, now)
         elif not said(frame).answer:
-            self._start(self._ask_for(frame, route, way, now), _name(frame, route))
+            name = _stop_of(route) if lane(frame) == STOP_LANE else None
+            waits = name is None or self._stops_of(route) < STOPS_KEPT
+            self._start(self._ask_for(frame, route, way, now, waits=waits), name)
         return LINK_DOWN if down else ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
@@ -283,8 +285,11 @@ class Resident:
         except CallError as error:
             log.info("greeting %s: %s", route.robot, error)
 
-    async def _ask_for(self, frame: Frame, route: Route, way: Way, arrived: float) -> None:
-        """Do for the sender of `frame`, in words, what a robot of bytes is told; answer in the robot's name."""
+    async def _ask_for(self, frame: Frame, route: Route, way: Way, arrived: float, *, waits: bool) -> None:
+        """Do for the sender of `frame`, in words, what a robot of bytes is told; answer in the robot's name.
+
+        Unless it `waits`, the answer is not waited for, and only a refusal is told.
+        """
         word, *words = frame.payload.decode("ascii", "replace").split() or [frame.subject]
         name = str(route.robot)
         longest_s = self._exchange.links[route.way.link].configuration.options.longest_wait_s(word)
@@ -292,6 +297,9 @@ class Resident:
         try:
             # A robot may send more words than a program may parameters.
             request = CallRequest.model_construct(parameters=list[Value](words))
+            if not waits:
+                await self._calling.tell(route.robot, word, request, arrived, Caller(frame.source, way))
+                return
             answer = await self._calling.ask(route, word, request, fresh_s, Caller(frame.source, way))
         except CallError as error:
             log.debug("%s told %s %s: %s", frame.source, name, word, error)
@@ -304,11 +312,14 @@ class Resident:
                 self._say(refusal(frame, name))
 
     def _has_room(self, frame: Frame, route: Route) -> bool:
-        """Whether `frame` can be done for its sender; of more stops of one robot, those under way stop it as well."""
-        if lane(frame) != STOP_LANE:
-            return len(self._tasks) < TASKS_KEPT
-        name = _name(frame, route)
-        return sum(task.get_name() == name for task in self._tasks) < STOPS_KEPT
+        """Whether `frame` can be done for its sender; there is for a stop, unless others have yet to leave."""
+        if lane(frame) == STOP_LANE:
+            return self._stops_of(route) < 2 * STOPS_KEPT
+        return len(self._tasks) < TASKS_KEPT
+
+    def _stops_of(self, route: Route) -> int:
+        """How many stops in words its robot is being told."""
+        return sum(task.get_name() == _stop_of(route) for task in self._tasks)
 
     def _start(self, work: Coroutine[Any, Any, None], name: str | None = None) -> None:
         task = asyncio.get_running_loop().create_task(work, name=name)
@@ -316,6 +327,6 @@ class Resident:
         task.add_done_callback(self._tasks.discard)
 
 
-def _name(frame: Frame, route: Route) -> str | None:
-    """By which the stops of one robot are known among what goes on."""
-    return f"stop {route.robot}" if lane(frame) == STOP_LANE else None
+def _stop_of(route: Route) -> str:
+    """The name by which the stops of one robot are known among what goes on."""
+    return f"stop {route.robot}"

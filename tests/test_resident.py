@@ -70,7 +70,7 @@ def said(transport: MemoryTransport) -> list[str]:
 class Lab:
     """A resident between links of lists; `BRACO` is at the end of a link `arm` if there is one.
 
-    The numbers of `robots_of_bytes` are on a link `field`.
+    The numbers of `robots_of_bytes` are on a link `field`, `MITYA` is on a link `corpo`.
     """
 
     def __init__(
@@ -90,6 +90,8 @@ class Lab:
             bindings = (Binding(Address.named(braco), number, Way("arm"), "psiu-hexa"),)
         if any(link.name == "field" for link in links):
             own[Address.numbered(0)] = "psiu-hexa"
+        if any(link.name == "corpo" for link in links):
+            bindings += (Binding(Address.named("MITYA"), None, Way("corpo"), "mitya"),)
         for each in robots_of_bytes:
             bindings += (Binding(Address.named(f"R{each}"), Address.numbered(each), Way("field"), "psiu-hexa"),)
         self.router = Router(own, bindings, identity, self._heard, self._gone)
@@ -269,10 +271,24 @@ async def test_a_stop_in_words_has_room_whatever_waits_and_a_flood_of_stops_is_b
     for _ in range(TASKS_KEPT + 2):
         lab.hears("radio", wire("PC", "BRACO", "sonar"))
     account = lab.exchange.accounts["radio"]
-    for _ in range(STOPS_KEPT + 3):
+    for _ in range(2 * STOPS_KEPT + 3):
         lab.hears("radio", wire("PC", "BRACO", "pare"))
     assert account.fates["refused"] == 2 + 3
-    assert len(lab.resident._tasks) == TASKS_KEPT + STOPS_KEPT
+    assert len(lab.resident._tasks) == TASKS_KEPT + 2 * STOPS_KEPT
+
+
+async def test_a_robot_that_answers_no_stop_is_stopped_again_when_it_moves_again(labs: Labs) -> None:
+    lab = labs(words(), configuration("corpo", "mitya", None, {"version": "2013"}, greet=False))
+    for _ in range(STOPS_KEPT):
+        lab.hears("radio", wire("EVIL", "MITYA", "pare"))
+    await settled()
+    lab.hears("radio", wire("EVIL", "MITYA", "drive", "255"))
+    await settled()
+    for _ in range(3 * STOPS_KEPT):
+        lab.hears("radio", wire("PC", "MITYA", "pare"))
+        await settled()
+    assert lab.far["corpo"].wires[STOPS_KEPT:] == [b"G00FF", *[b"G0000"] * 3 * STOPS_KEPT]
+    assert len(lab.resident._tasks) == STOPS_KEPT + 1, "the drive waits for its answer"
 
 
 async def test_what_is_said_for_others_is_not_logged_frame_by_frame(
