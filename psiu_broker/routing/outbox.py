@@ -201,7 +201,11 @@ class Outbox:
     def _line_up(self, stop: Parcel) -> None:
         """Put `stop` before the second one of a way if it is its own way's first, and so on."""
         waiting = self._lanes[STOP_LANE]
-        turn = sum(each.fate.arrived == stop.fate.arrived for each in waiting)
+        way = stop.fate.arrived
+        turn = sum(each.fate.arrived == way for each in waiting)
+        if turn == len(waiting):  # a flood by one way alone
+            waiting.append(stop)
+            return
         before: Counter[Way] = Counter()
         for place, each in enumerate(waiting):
             if before[each.fate.arrived] > turn:
@@ -212,15 +216,15 @@ class Outbox:
 
     def _surplus_stop(self, newcomer: Parcel) -> Parcel:
         waiting = self._lanes[STOP_LANE]
-        stops: Counter[object] = Counter()
-        for each in (*waiting, newcomer):
-            stops.update((each.fate.arrived, (each.fate.arrived, each.fate.frame.destination)))
-
-        def surplus(each: Parcel) -> tuple[int, int]:
-            way, robot = each.fate.arrived, each.fate.frame.destination
-            return stops[way], stops[way, robot]
-
-        return max(waiting, key=surplus)
+        ways = Counter(each.fate.arrived for each in waiting)
+        ways[newcomer.fate.arrived] += 1
+        way = max(ways, key=ways.__getitem__)
+        crowd = [each for each in waiting if each.fate.arrived == way]
+        robots = Counter(each.fate.frame.destination for each in crowd)
+        if newcomer.fate.arrived == way:
+            robots[newcomer.fate.frame.destination] += 1
+        robot = max(robots, key=robots.__getitem__)
+        return next(each for each in crowd if each.fate.frame.destination == robot)
 
     def _take_out(self, unwanted: Callable[[Parcel], bool]) -> list[Parcel]:
         taken: list[Parcel] = []
