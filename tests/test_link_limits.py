@@ -1,5 +1,6 @@
 """What a link holds back, what passes, and how long it took: a clock and timers of our own."""
 
+import asyncio
 from collections import Counter
 from typing import Any, cast
 
@@ -7,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from memory_adapter import MemoryAdapter, MemoryDatagrams, MemoryTransport, codec_of, configuration
+from paced_lab import Clock
 from test_link import Hub
-from test_paced_link import Clock
 
 from psiu_broker import link as link_module
 from psiu_broker.codecs import psiu_ascii
@@ -209,6 +210,26 @@ def test_what_waited_for_a_robot_does_not_move_it_after_its_stop_even_if_that_le
     lab.clock.pass_on(1.5)
     assert lab.left == ["pare"]
     assert lab.hub.fates == ["superseded"]
+
+
+async def test_a_link_is_drained_when_a_stop_took_the_place_of_the_last_that_waited() -> None:
+    lab = Lab(max_frames_s=1.0)
+    for number in range(2):
+        lab.offer(say("parafrente", str(number)))
+    drained = asyncio.ensure_future(lab.link.drained())
+    await asyncio.sleep(0)
+    lab.transport.full = True
+    lab.offer(say("pare"))
+    lab.transport.full = False
+    await asyncio.sleep(0)
+    assert not drained.done(), "the stop itself waits"
+    lab.offer(say("parafrente", "3", to=BETA))
+    lab.link.writable()
+    await asyncio.sleep(0)
+    assert not drained.done(), "a limit holds another back"
+    assert lab.offer(say("pare", to=BETA)) == "delivered"
+    async with asyncio.timeout(5):
+        await drained
 
 
 def test_stops_keep_their_order() -> None:
