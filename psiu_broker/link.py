@@ -261,6 +261,7 @@ class Link(Kept):
                 self._supersede(self.outbox.overtaken(parcel), now)
             if self._is_next(parcel, now) and write(wire, peer):
                 self._left(parcel, now)
+                self._note_empty()
                 return DELIVERED
         if self._transport is None:
             return LINK_DOWN
@@ -288,7 +289,7 @@ class Link(Kept):
 
     async def drained(self) -> None:
         """Return when nothing waits to be sent."""
-        if self.outbox.size:
+        while self.outbox.size:
             await self._empty.wait()
 
     # Inside.
