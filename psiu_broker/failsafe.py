@@ -231,8 +231,9 @@ class Failsafe:
     def _asked_of(self, ward: Ward) -> tuple[str, bytes]:
         profile = self._profile(ward.robot)
         if not ward.asked_of[0] and profile is not None:
-            request = profile.request(ward.options.command, ward.options.parameters)
-            ward.asked_of = request.subject, request.payload
+            with suppress(CallError):  # by what a robot says of itself it may not know the command
+                request = profile.request(ward.options.command, ward.options.parameters)
+                ward.asked_of = request.subject, request.payload
         return ward.asked_of
 
     def _moves(self, ward: Ward, frame: Frame) -> bool:

@@ -2,6 +2,8 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
+from types import SimpleNamespace
+from typing import NoReturn
 
 import pytest
 
@@ -385,6 +387,21 @@ async def test_what_stops_the_robot_is_a_stop_in_whatever_words_it_is_sent() -> 
     assert lab.failsafe.stops(frame)
     lab.failsafe.left("radio", frame, lab.now)
     assert not ward.moves
+
+
+async def test_a_robot_that_says_it_cannot_be_stopped_so_breaks_no_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a board that tells what its pins can do before it was sent anything."""
+    lab = Lab(command="desliga")
+
+    def cannot(*_: object) -> NoReturn:
+        raise CallError("refused", "pin 13 cannot be output")
+
+    monkeypatch.setattr(lab.failsafe, "_profile", lambda _: SimpleNamespace(request=cannot, moves=PROFILE.moves))
+    assert not lab.failsafe.stops(lab.frame("parafrente 10"))
+    lab.failsafe.left("radio", lab.frame("parafrente 10"), lab.now)
+    ward = lab.failsafe.ward(MNERIM)
+    assert ward is not None
+    assert ward.moves
 
 
 async def test_what_stops_the_robot_is_a_stop_whatever_its_word() -> None:
