@@ -4,10 +4,12 @@ The first byte of an input chooses among the configurations of its target, the s
 """
 
 import contextlib
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, Final
+from types import FrameType
+from typing import Any, Final, NoReturn
 
 from attack.robots import CALLS, MAPS, ROBOTS
 
@@ -29,6 +31,8 @@ from psiu_broker.trunk.wire import Reader
 KEYS: Final = Keys()
 FRAMES_USED: Final = 20
 """Of each input, so that longer ones are not dearer without finding more."""
+SLOWEST_S: Final = 10
+"""CPU time that one input may take at most."""
 NOW: Final = datetime(2026, 1, 1, tzinfo=UTC)
 
 OPTIONS: Final[Mapping[str, Sequence[dict[str, Any]]]] = {
@@ -246,7 +250,7 @@ def as_a_key(data: bytes) -> None:
             read_key("psiu/" + key)
 
 
-TARGETS: Final[Mapping[str, Callable[[bytes], None]]] = {
+TARGETS: Final[dict[str, Callable[[bytes], None]]] = {
     **{protocol: partial(hear, protocol) for protocol in PROTOCOLS},
     "envelope": from_a_broker,
     "trunk": over_a_trunk,
@@ -254,3 +258,22 @@ TARGETS: Final[Mapping[str, Callable[[bytes], None]]] = {
     "key": as_a_key,
 }
 """By the names that `python -m tests.attack` takes."""
+
+
+def tell(name: str, data: bytes, limit_s: float = SLOWEST_S) -> None:
+    """Attack the target `name` with `data`.
+
+    Raises:
+        TimeoutError: it takes more CPU time than `limit_s`. A busy machine makes no difference.
+    """
+    old = signal.signal(signal.SIGVTALRM, partial(_too_slow, limit_s))
+    signal.setitimer(signal.ITIMER_VIRTUAL, limit_s)
+    try:
+        TARGETS[name](data)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, old)
+
+
+def _too_slow(limit_s: float, signum: int, frame: FrameType | None) -> NoReturn:
+    raise TimeoutError(f"one input takes more than {limit_s:g} s of CPU time")

@@ -3,13 +3,14 @@
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from attack import __main__ as runner
 from attack import corpus
 from attack.corpus import kept
-from attack.targets import TARGETS
+from attack.targets import TARGETS, tell
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -83,11 +84,25 @@ def test_what_broke_a_target_is_printed_whole_with_what_tells_it_again(
 
 def test_an_input_told_again_fails_as_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[bytes] = []
-    monkeypatch.setattr(runner, "TARGETS", {"trunk": heard.append})
+    monkeypatch.setitem(TARGETS, "trunk", heard.append)
     assert CliRunner().invoke(runner.main, ["--input", "00ff", "trunk"]).exit_code == 0
     assert heard == [b"\x00\xff"]
-    monkeypatch.setattr(runner, "TARGETS", {"trunk": lambda _: 1 / 0})
+    monkeypatch.setitem(TARGETS, "trunk", lambda _: 1 / 0)
     assert isinstance(CliRunner().invoke(runner.main, ["--input", "00", "trunk"]).exception, ZeroDivisionError)
+
+
+def test_an_input_is_too_slow_by_its_own_time_and_not_by_that_of_a_busy_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def endless(_: bytes) -> None:
+        while True:
+            pass
+
+    monkeypatch.setitem(TARGETS, "trunk", endless)
+    with pytest.raises(TimeoutError, match="of CPU time"):
+        tell("trunk", b"", 0.05)
+    monkeypatch.setitem(TARGETS, "trunk", lambda _: time.sleep(0.2))
+    tell("trunk", b"", 0.05)
 
 
 def test_the_fuzzer_attacks_a_target_for_as_long_as_it_is_told() -> None:
