@@ -278,12 +278,15 @@ class Failsafe:
             task.add_done_callback(self._tries.discard)
 
     async def _carry_out(self, ward: Ward) -> None:
-        """Have the robot stopped; if that does not leave, it stays due."""
+        """Have the robot stopped; if that does not leave, or its link may have lost it, it stays due."""
         try:
             await self._stop(ward.robot, ward.options, LAST_S)
         except CallError as error:
             if ward.stopping is not asyncio.current_task():  # it has left
                 log.warning("%s was told to stop, and may go on: %s", ward.robot, error)
+                if error.code == "link_down" and not ward.moves:  # which may have lost it
+                    ward.moved_at, ward.due, ward.failed = self._clock(), str(error), False
+                    self._begin(ward)
             elif error.code == "unknown_robot":  # it is another broker's
                 log.warning("%s is not told to stop: %s", ward.robot, error)
                 _let_go(ward)

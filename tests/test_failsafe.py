@@ -42,7 +42,7 @@ class Lab:
         self.now, self.heard_at = 100.0, 0.0
         self.stopped: list[str] = []
         self.fails: CallError | None = None
-        self.answers = True
+        self.answers, self.cut_off = True, False
         self.failsafe = Failsafe(made, self._stop, lambda _: PROFILE, lambda _: self.heard_at, lambda: self.now)
         self.failsafe.link_opened("radio")
         self.command = command
@@ -78,6 +78,9 @@ class Lab:
         if self.fails is not None:
             raise self.fails
         self.failsafe.left("radio", self.frame(self.command, robot), self.now)
+        if self.cut_off:
+            self.failsafe.link_closed("radio")
+            raise CallError("link_down", "before it answered")
         if not self.answers:
             await asyncio.sleep(timeout_s)
 
@@ -241,6 +244,33 @@ async def test_a_robot_whose_link_went_down_is_stopped_when_it_is_open_again_and
     lab.failsafe.link_opened("radio")
     assert await lab.after(0) == before + 1
     assert await lab.after(60) == before + 1
+
+
+async def cut_off_before_it_answered() -> Lab:
+    """MNERIM, whose stop left as its link went down."""
+    lab = Lab()
+    lab.cut_off = True
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(60) == 1
+    lab.cut_off = False
+    return lab
+
+
+async def test_a_stop_that_its_link_may_have_lost_is_sent_anew_when_the_link_is_open_again() -> None:
+    lab = await cut_off_before_it_answered()
+    lab.failsafe.link_opened("radio")
+    assert await lab.after(0) == 2
+    assert await lab.after(60) == 2
+
+
+async def test_a_stop_that_its_link_may_have_lost_is_not_sent_anew_once_another_program_moves_the_robot() -> None:
+    lab = await cut_off_before_it_answered()
+    lab.failsafe.program_came("q")
+    lab.moves("q")
+    lab.failsafe.link_opened("radio")
+    assert await lab.after(60) == 1
 
 
 async def due_and_stuck(*on: str) -> Lab:
