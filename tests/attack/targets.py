@@ -244,10 +244,10 @@ def from_a_program(data: bytes) -> None:
 def as_a_key(data: bytes) -> None:
     """A key of the bus is read, or refused with a ValueError."""
     key = data.decode("utf-8", "replace")
-    for read_key in (KEYS.read_call, KEYS.read_decoded, KEYS.read_card, KEYS.read_broker):
-        with contextlib.suppress(ValueError):
-            read_key(key)
-            read_key("psiu/" + key)
+    for read_key in (KEYS.read_call, KEYS.read_decoded, KEYS.read_card, KEYS.read_broker, KEYS.read_program):
+        for each in (key, "psiu/" + key):
+            with contextlib.suppress(ValueError):
+                read_key(each)
 
 
 TARGETS: Final[dict[str, Callable[[bytes], None]]] = {
