@@ -77,6 +77,11 @@ def program(endpoint: str, tls: TlsConfiguration | None, mode: str = "client") -
         session.close()
 
 
+def in_order(note: Callable[[zenoh.Sample], None]) -> Any:
+    """What several subscribers are told, in the order in which it came: each would have a thread of its own."""
+    return zenoh.handlers.Callback(note, indirect=False)
+
+
 class Spy:
     """All that comes by a session, in its order; `forged`: with the mark `FORGED`. Tokens are those that came."""
 
@@ -87,8 +92,8 @@ class Spy:
         self._session = session
         self._declared: list[Any] = []
         for key in ("psiu/**", "psiu/@mesh/**", "psiu/@call/**", "psiu/@raw/**", "psiu/@broker/**"):
-            self._declared.append(session.declare_subscriber(key, self._note, allowed_origin=REMOTE))
-            self._declared.append(session.liveliness().declare_subscriber(key, self._note_token))
+            self._declared.append(session.declare_subscriber(key, in_order(self._note), allowed_origin=REMOTE))
+            self._declared.append(session.liveliness().declare_subscriber(key, in_order(self._note_token)))
 
     def _note(self, sample: zenoh.Sample) -> None:
         self.seen.append(str(sample.key_expr))

@@ -4,7 +4,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
 from threading import Thread
@@ -12,12 +12,13 @@ from typing import Any, Final
 
 import pytest
 import zenoh
-from secure_lab import REMOTE, SecureLab
+from secure_lab import REMOTE, SecureLab, in_order
 
 from psiu_broker.bus.access import EVERYTHING
 
 ROLES: Final = {"screen": "listener", "operator": "commander", "hill": "broker"}
 ACTIONS: Final = ("put", "delete", "ask", "hear", "answer", "declare a token", "see a token")
+BLOCK: Final = zenoh.CongestionControl.BLOCK
 HEAR, ASK = {"hear"}, {"ask"}
 NOTHING: Final[set[str]] = set()
 
@@ -74,9 +75,10 @@ class Site:
 
     def settled(self, session: zenoh.Session) -> None:
         """Return once all that `session` has said before has been judged by the broker."""
-        assert list(session.get("psiu/@broker/base/status", timeout=10))
+        until(lambda: list(session.get("psiu/@broker/base/status", timeout=10)), 60)
 
-    def allowed(self, session: zenoh.Session, action: str, key: str) -> bool:
+    def allowed(self, session: zenoh.Session, action: str, key: str) -> bool | None:
+        """None: half of it, a question without its answer."""
         mark = f"psiu/mark/mark/{next(self._serial)}"
         return {
             "put": lambda: self._tells(session, key, mark, delete=False),
@@ -84,19 +86,30 @@ class Site:
             "hear": lambda: self._hears(session, key, mark),
             "ask": lambda: self._asks(session, self.witness, key, mark),
             "answer": lambda: self._asks(self.witness, session, key, mark),
-            "declare a token": lambda: self._shows(session, self.witness, f"{key}/{mark[-1]}", mark),
-            "see a token": lambda: self._shows(self.witness, session, f"{key}/{mark[-1]}", mark),
+            "declare a token": lambda: self._shows(session, self.witness, f"{key}/{mark.rpartition('/')[2]}", mark),
+            "see a token": lambda: self._shows(self.witness, session, f"{key}/{mark.rpartition('/')[2]}", mark),
         }[action]()
+
+    def _mark(self, session: zenoh.Session, mark: str, seen: Callable[[], object]) -> None:
+        """Return once `mark` is seen; it is said again, as Zenoh may end a link on a busy machine."""
+        for _ in range(10):
+            session.put(mark, b"", attachment=mark.encode(), congestion_control=BLOCK)
+            with suppress(AssertionError):
+                until(seen, 3)
+                return
+        raise AssertionError(f"{mark} was not seen")
 
     def _tells(self, session: zenoh.Session, key: str, mark: str, *, delete: bool) -> bool:
         seen: list[tuple[str, bytes]] = []
         subscribers = [self.witness.declare_subscriber(each, noting(seen)) for each in (key, mark)]
         self.settled(self.witness)
-        (session.delete if delete else lambda *a, **k: session.put(*a, b"{}", **k))(key, attachment=mark.encode())
+        if delete:
+            session.delete(key, attachment=mark.encode(), congestion_control=BLOCK)
+        else:
+            session.put(key, b"{}", attachment=mark.encode(), congestion_control=BLOCK)
         self.settled(session)
         # Behind what the broker let pass.
-        self.sessions["hill"].put(mark, b"", attachment=mark.encode())
-        until(lambda: (mark, mark.encode()) in seen)
+        self._mark(self.sessions["hill"], mark, lambda: (mark, mark.encode()) in seen)
         for each in subscribers:
             each.undeclare()
         return (key, mark.encode()) in seen
@@ -105,14 +118,13 @@ class Site:
         seen: list[tuple[str, bytes]] = []
         subscribers = [session.declare_subscriber(each, noting(seen)) for each in (key, mark)]
         self.settled(session)
-        for each in (key, mark):
-            self.witness.put(each, b"", attachment=mark.encode())
-        until(lambda: (mark, mark.encode()) in seen)
+        self.witness.put(key, b"", attachment=mark.encode(), congestion_control=BLOCK)
+        self._mark(self.witness, mark, lambda: (mark, mark.encode()) in seen)
         for subscriber in subscribers:
             subscriber.undeclare()
         return (key, mark.encode()) in seen
 
-    def _asks(self, asker: zenoh.Session, answerer: zenoh.Session, key: str, mark: str) -> bool:
+    def _asks(self, asker: zenoh.Session, answerer: zenoh.Session, key: str, mark: str) -> bool | None:
         asked: list[str] = []
 
         def answer(query: zenoh.Query) -> None:
@@ -126,8 +138,7 @@ class Site:
         )
         got = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
         queryable.undeclare()
-        assert (mark.encode() in got) == bool(asked), "one who is asked is heard too"
-        return mark.encode() in got
+        return None if asked and mark.encode() not in got else bool(asked)
 
     def _shows(self, shower: zenoh.Session, watcher: zenoh.Session, key: str, mark: str) -> bool:
         seen: list[tuple[str, bytes]] = []
@@ -137,22 +148,20 @@ class Site:
         self.settled(watcher)
         token = shower.liveliness().declare_token(key)
         self.settled(shower)
-        self.sessions["hill"].put(mark, b"", attachment=mark.encode())
-        until(lambda: heard)
-        by_asking = [each for each in watcher.liveliness().get(key, timeout=1) if each.ok is not None]
+        self._mark(self.sessions["hill"], mark, lambda: heard)
+        found = [each for each in watcher.liveliness().get(key, timeout=10) if each.ok is not None]
         token.undeclare()
         subscriber.undeclare()
         marks.undeclare()
-        assert bool(by_asking) == bool(seen), "a token is told of, and found, or neither"
-        return bool(seen)
+        return bool(seen or found)
 
 
-def noting(seen: list[tuple[str, bytes]]) -> Callable[[zenoh.Sample], None]:
+def noting(seen: list[tuple[str, bytes]]) -> Any:
     def note(sample: zenoh.Sample) -> None:
         attachment = sample.attachment
         seen.append((str(sample.key_expr), b"" if attachment is None else attachment.to_bytes()))
 
-    return note
+    return in_order(note)
 
 
 def until(true: Callable[[], object], timeout_s: float = 15.0) -> None:
@@ -177,7 +186,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 def test_each_role_may_do_with_each_key_what_is_said_here_and_nothing_else(site: Site, key: str, name: str) -> None:
     listener, commander = KEYS[key]
     may = {"listener": listener, "commander": listener | commander, "broker": set(ACTIONS)}[ROLES[name]]
-    assert {action for action in ACTIONS if site.allowed(site.sessions[name], action, key)} == may
+    session = site.sessions[name]
+    done = {action: site.allowed(session, action, key) for action in ACTIONS}
+    # What is allowed may fail where Zenoh ends a link on a busy machine; what is not allowed may not pass once.
+    done |= {action: site.allowed(session, action, key) for action in may if not done[action]}
+    assert done == {action: action in may for action in ACTIONS}
 
 
 def test_every_key_of_the_bus_is_among_those_that_are_tried(site: Site) -> None:
