@@ -113,7 +113,7 @@ async def test_who_is_no_program_takes_no_robot_from_the_program_that_moved_it(t
     lab.moves("p")
     lab.failsafe.left("radio", lab.frame(text, to), lab.now)
     lab.failsafe.program_gone("p")
-    assert await lab.after(1) == 1
+    assert await lab.after(0) == 1
 
 
 async def test_a_call_of_nobody_in_particular_takes_no_robot_from_a_program() -> None:
@@ -122,7 +122,7 @@ async def test_a_call_of_nobody_in_particular_takes_no_robot_from_a_program() ->
     lab.moves("p")
     lab.moves(None, "buzina")
     lab.failsafe.program_gone("p")
-    assert await lab.after(1) == 1
+    assert await lab.after(0) == 1
 
 
 async def test_what_a_program_asked_for_before_it_went_in_good_order_takes_no_robot_from_another() -> None:
@@ -133,7 +133,14 @@ async def test_what_a_program_asked_for_before_it_went_in_good_order_takes_no_ro
     lab.failsafe.program_done("q")
     lab.moves("q")
     lab.failsafe.program_gone("p")
-    assert await lab.after(1) == 1
+    assert await lab.after(0) == 1
+
+
+async def test_who_is_no_program_is_not_missed() -> None:
+    lab = Lab()
+    lab.moves()
+    lab.moved_by_another_robot()
+    assert await lab.after(60) == 0
 
 
 async def test_all_robots_of_a_program_are_stopped_and_no_other() -> None:
