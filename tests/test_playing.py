@@ -47,7 +47,7 @@ MAP = {
 ONE, OTHER = ("10.0.0.1", 9001), ("10.0.0.2", 9001)
 
 
-async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
+async def until(true: Callable[[], object], timeout_s: float = 30.0) -> None:
     async with asyncio.timeout(timeout_s):
         while not true():  # noqa: ASYNC110
             await asyncio.sleep(0.002)

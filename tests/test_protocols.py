@@ -28,7 +28,7 @@ from psiu_broker.simulator.soccer import SoccerRobot
 CODEC = PsiuAscii(PsiuAscii.Options(), Directory())
 
 
-async def until(true: Callable[[], object], timeout_s: float = 5.0) -> None:
+async def until(true: Callable[[], object], timeout_s: float = 30.0) -> None:
     """The broker's state is values, not events: look until it is so."""
     async with asyncio.timeout(timeout_s):
         while not true():  # noqa: ASYNC110

@@ -443,9 +443,9 @@ async def test_a_motion_is_sent_again_only_on_a_complaint_of_its_own(labs: Labs,
 
 
 async def test_the_answer_to_a_command_that_left_late_is_not_the_next_ones(labs: Labs) -> None:
-    lab = labs(arm(timeout_s=0.3))
+    lab = labs(arm(timeout_s=5.0))
     lab.far["arm"].full = True
-    first = asyncio.ensure_future(lab.call("BRACO", "garra", 45, timeout_s=0.05))
+    first = asyncio.ensure_future(lab.call("BRACO", "garra", 45, timeout_s=0.5))
     await settled()
     lab.hears("arm", arm_says(b"A"))
     await settled()
