@@ -286,8 +286,9 @@ async def test_what_comes_to_a_broker_that_stops_takes_nobodys_room(
     program.put("psiu/@call/A/b", b"")
     await until(lambda: calls.refused_puts)
     for _ in range(2):
-        [refusal] = await ask(program, "psiu/@call/A/b")
-        assert refusal.error == "shutting_down"
+        async with asyncio.timeout(5):
+            while (await ask(program, "psiu/@call/A/b"))[0].error != "shutting_down":
+                pass  # busy: a refusal gives its room back a moment after it has left
     assert robots.called == robots.sent == []
 
 
