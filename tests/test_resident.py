@@ -20,6 +20,7 @@ from psiu_broker.config.tables import (
     RobotConfiguration,
     ZenohConfiguration,
 )
+from psiu_broker.config.who import ends
 from psiu_broker.errors import CallError, LinkLost
 from psiu_broker.exchange import Exchange
 from psiu_broker.frame import Address, Way
@@ -29,6 +30,7 @@ from psiu_broker.profiles import Node
 from psiu_broker.profiles.hexa import HexaOptions
 from psiu_broker.profiles.rarely import REMEMBERED
 from psiu_broker.profiles.responder import NAMES_AT_ONCE
+from psiu_broker.protocols import PROTOCOLS
 from psiu_broker.resident import STOPS_KEPT, TASKS_KEPT, Resident
 from psiu_broker.routing.router import Router
 from psiu_broker.routing.table import Binding, Route
@@ -70,7 +72,7 @@ def said(transport: MemoryTransport) -> list[str]:
 class Lab:
     """A resident between links of lists; `BRACO` is at the end of a link `arm` if there is one.
 
-    The numbers of `robots_of_bytes` are on a link `field`, `MITYA` is on a link `corpo`.
+    The numbers of `robots_of_bytes` are on a link `field`, `MITYA` is on a link `corpo`, `UNO` on `placa`.
     """
 
     def __init__(
@@ -90,8 +92,11 @@ class Lab:
             bindings = (Binding(Address.named(braco), number, Way("arm"), "psiu-hexa"),)
         if any(link.name == "field" for link in links):
             own[Address.numbered(0)] = "psiu-hexa"
-        if any(link.name == "corpo" for link in links):
-            bindings += (Binding(Address.named("MITYA"), None, Way("corpo"), "mitya"),)
+        for robot, place, protocol in (("MITYA", "corpo", "mitya"), ("UNO", "placa", "firmata")):
+            if any(link.name == place for link in links):
+                options = PROTOCOLS[protocol].profile.Options()
+                robots[robot] = RobotConfiguration(robot, place, protocol, None, None, options)
+                bindings += (Binding(Address.named(robot), None, Way(place), protocol),)
         for each in robots_of_bytes:
             bindings += (Binding(Address.named(f"R{each}"), Address.numbered(each), Way("field"), "psiu-hexa"),)
         self.router = Router(own, bindings, identity, self._heard, self._gone)
@@ -106,7 +111,11 @@ class Lab:
         for link in links:
             unaddressed = link.name == "arm"
             self.links[link.name] = Link(
-                link, lambda link=link: codec_of(link, directory), self.exchange, unaddressed=unaddressed
+                link,
+                lambda link=link: codec_of(link, directory),
+                self.exchange,
+                unaddressed=unaddressed,
+                ends=ends(made, link),
             )
             self.exchange.add(self.links[link.name])
             self.connect(link.name, MemoryTransport(link.adapter.ends))
@@ -470,6 +479,25 @@ async def test_a_command_that_never_left_is_said_to_have_expired(labs: Labs) -> 
     lab.far["radio"].full = True
     assert await refused(lab.call("MNERIM", "parafrente", 5, timeout_s=0.1)) == "expired"
     assert lab.links["radio"].outbox.size == 0
+
+
+@pytest.mark.parametrize("why", ["its link was stuck", "its link was down"])
+async def test_an_order_that_never_left_is_not_sent_along_with_the_next(labs: Labs, why: str) -> None:
+    """To a board that knows no single pins, and is told of a whole port at once."""
+    lab = labs(configuration("placa", "firmata", None, None, greet=False))
+    lab.hears("placa", bytes.fromhex("f90203"))
+    await lab.tell("UNO", "digital", 8, 1)
+    if why == "its link was stuck":
+        lab.far["placa"].full = True
+        await lab.tell("UNO", "digital", 9, 1)
+        lab.links["placa"].expire(time.monotonic() + 1000)
+        lab.far["placa"].full = False
+    else:
+        lab.links["placa"].lost(LinkLost("unplugged"))
+        assert await refused(lab.tell("UNO", "digital", 9, 1)) == "link_down"
+        lab.connect("placa", MemoryTransport())
+    await lab.tell("UNO", "digital", 10, 1)
+    assert lab.far["placa"].wires[-1].hex() == "910500f06d0af7"
 
 
 async def test_an_outbox_that_reads_its_clock_a_moment_later_still_tells_what_never_left(labs: Labs) -> None:

@@ -15,6 +15,10 @@ def test_what_left_at_once_counts_as_no_delay() -> None:
     delays.note(5, 0.040)
     assert delays.ms(100) == (0.0, 40.0)
     assert delays.ms(1000 + 4) == (0.0, 0.0), "one in a thousand is beyond p99"
+    for number in range(1, 21):
+        delays.note(number, 0.040)
+    assert delays.ms(1000 + 9) == (0.0, 40.0)
+    assert delays.ms(1000 + 20) == (0.0, 0.0), "all are too long ago"
     delays = Delays()
     delays.note(1, 0.002)
     assert delays.ms(1) == (2.0, 2.0)
