@@ -53,7 +53,7 @@ FILLERS: Final = 5
 """How often a body may be moved on by one byte; after so many it has been asked at each of the five places."""
 PLAY: Final = "play"
 
-_BURSTS_KEPT: Final = 8
+_BURSTS_KEPT: Final = 64
 _STOPS: Final = ("pare",)
 _RESERVED: Final = STOP_WORDS | {NAME, COUNT, SHOW, SHOW_PRINTED}
 _SAID_BY_ROBOTS: Final = frozenset({"error", "telemetry", "hit"})

@@ -203,6 +203,17 @@ def test_where_a_one_shot_is_sent_more_often_more_answers_are_awaited() -> None:
     assert replies == [None, None, None, Reply("sucesso")]
 
 
+def test_many_that_are_under_way_at_once_are_each_answered_and_what_was_answered_long_ago_is_forgotten() -> None:
+    robot = profile("2013")
+    requests = [robot.request("fire", []) for _ in range(32)]
+    for reply in (None, Reply("sucesso")):
+        done = heard("#0000", "2013")
+        assert [robot.read(request, done) for request in requests] == [reply] * 32
+    for _ in range(1000):
+        robot.read(robot.request("fire", []), heard("#0000", "2013"))
+    assert len(robot._bursts) < 100
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_phone_tells_only_errors(version: Version) -> None:
     robot = profile(version, datagrams=True)
