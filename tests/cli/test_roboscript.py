@@ -23,7 +23,7 @@ from psiu_broker.config import load
 from psiu_broker.errors import CallError
 from psiu_broker.frame import Address
 from psiu_broker.messages import Answer, CallRequest, Refusal
-from psiu_broker.profiles.roboscript import vocabulary
+from psiu_broker.profiles.roboscript import recording, vocabulary
 from psiu_broker.simulator import PtyPort, UdpPort
 from psiu_broker.simulator.mitya import Action, MityaBody
 from psiu_broker.simulator.robot import Reply
@@ -234,6 +234,14 @@ async def test_at_a_terminal_the_progress_is_one_line_that_goes_when_it_is_done(
         assert gone == "\x1b[K"
 
 
+@pytest.fixture
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages so far apart that a busy machine hears the objection to one before it sends the next."""
+    monkeypatch.setattr(recording, "PAUSE_S", 0.125)
+    monkeypatch.setattr(recording, "FIRST_PAUSES", 2)
+
+
+@pytest.mark.usefixtures("unhurried")
 @pytest.mark.parametrize("version", ["2012", "2013"])
 async def test_what_the_robot_objects_to_is_told_with_its_line(tmp_path: Path, version: str) -> None:
     body = Noisy(version=version)  # type: ignore[arg-type]
@@ -253,6 +261,7 @@ async def test_what_the_robot_objects_to_is_told_with_its_line(tmp_path: Path, v
         assert (in_json.exit_code, json.loads(in_json.stdout)["values"]) == (1, [code, 5])
 
 
+@pytest.mark.usefixtures("unhurried")
 async def test_a_body_that_lost_step_in_the_middle_is_brought_back_into_it(tmp_path: Path) -> None:
     body = Noisy()
     async with lab(tmp_path, body) as made:
