@@ -14,6 +14,9 @@ from psiu_broker.profiles.persona import PersonaOptions
 from psiu_broker.profiles.profile import RobotOptions
 from psiu_broker.routing.outbox import is_question
 
+_LONGEST_BROKER_NAME: Final = 255
+"""Other brokers believe in no longer one."""
+
 
 def robot_name(name: str) -> str:
     if not name.isascii() or not name.isprintable() or not name or name != name.strip():
@@ -29,6 +32,10 @@ def _broker_name(name: str) -> str:
     if " " in name:
         raise ValueError(
             f"expected a name without spaces, got {got(name)}: a robot that has not met it misreads it; choose one word"
+        )
+    if len(name) > _LONGEST_BROKER_NAME:
+        raise ValueError(
+            f"expected a name of at most {_LONGEST_BROKER_NAME} letters, got {len(name)}; choose a shorter word"
         )
     return robot_name(name)
 

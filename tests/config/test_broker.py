@@ -3,6 +3,8 @@
 import pytest
 from config.texts import BROKER
 
+from psiu_broker.mesh.beat import Beat
+
 
 @pytest.mark.parametrize(
     ("text", "expected"),
@@ -48,6 +50,13 @@ def test_a_wrong_value_is_refused_with_what_was_expected_and_what_was_got(proble
 def test_the_broker_s_name_is_one_that_a_robot_can_have(problems, name):
     (line,) = problems(f'[broker]\nname = "{name}"')
     assert line.startswith("broker.name: expected a name")
+
+
+def test_the_broker_s_name_is_one_that_other_brokers_can_read(read, problems):
+    longest = "x" * 255
+    assert read(f'[broker]\nname = "{longest}"').broker.name == Beat(broker=longest, epoch=1, sent_us=1).broker
+    (line,) = problems(f'[broker]\nname = "{longest}x"')
+    assert line == "broker.name: expected a name of at most 255 letters, got 256; choose a shorter word"
 
 
 def test_the_broker_s_name_is_one_that_robots_cannot_misread(problems):
