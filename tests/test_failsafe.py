@@ -43,6 +43,7 @@ class Lab:
         self.stopped: list[str] = []
         self.fails: CallError | None = None
         self.answers, self.cut_off = True, False
+        self.behind = ""
         self.failsafe = Failsafe(made, self._stop, lambda _: PROFILE, lambda _: self.heard_at, lambda: self.now)
         self.failsafe.link_opened("radio")
         self.command = command
@@ -78,6 +79,8 @@ class Lab:
         if self.fails is not None:
             raise self.fails
         self.failsafe.left("radio", self.frame(self.command, robot), self.now)
+        if self.behind:
+            self.moves(self.behind)
         if self.cut_off:
             self.failsafe.link_closed("radio")
             raise CallError("link_down", "before it answered")
@@ -276,6 +279,18 @@ async def test_a_stop_that_its_link_may_have_lost_is_not_sent_anew_once_another_
     lab = await cut_off_before_it_answered()
     lab.failsafe.program_came("q")
     lab.moves("q")
+    lab.failsafe.link_opened("radio")
+    assert await lab.after(60) == 1
+
+
+async def test_a_stop_that_its_link_may_have_lost_is_not_sent_anew_where_the_robot_was_moved_behind_it() -> None:
+    lab = Lab()
+    lab.failsafe.program_came("q")
+    lab.cut_off, lab.behind = True, "q"
+    lab.failsafe.program_came("p")
+    lab.moves("p")
+    lab.failsafe.program_gone("p")
+    assert await lab.after(0) == 1
     lab.failsafe.link_opened("radio")
     assert await lab.after(60) == 1
 

@@ -212,6 +212,26 @@ def test_what_waited_for_a_robot_does_not_move_it_after_its_stop_even_if_that_le
     assert lab.hub.fates == ["superseded"]
 
 
+async def test_a_link_is_not_drained_while_what_came_as_the_last_left_waits() -> None:
+    lab = Lab()
+    lab.transport.full = True
+    lab.offer(say("parafrente", "0"))
+    drained = asyncio.ensure_future(lab.link.drained())
+    await asyncio.sleep(0)
+    lab.transport.full = False
+    lab.link.writable()
+    lab.transport.full = True
+    lab.offer(say("pare"))
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert not drained.done()
+    lab.transport.full = False
+    lab.link.writable()
+    async with asyncio.timeout(5):
+        await drained
+    assert lab.left == ["parafrente 0", "pare"]
+
+
 async def test_a_link_is_drained_when_a_stop_took_the_place_of_the_last_that_waited() -> None:
     lab = Lab(max_frames_s=1.0)
     for number in range(2):
