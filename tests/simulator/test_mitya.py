@@ -219,6 +219,17 @@ class TestScripts:
         robot.advance(CLOCK_MS)
         assert robot.body.left == 2
 
+    def test_a_script_goes_on_only_while_its_slot_is_the_one_that_was_named_last(self) -> None:
+        robot = old()
+        record(robot, 0, "D0064", "W03E8", "D0032", "W03E8", "D0000", "W0000")
+        says(robot, "r0000")
+        says(robot, "r0109", "Z0000", "D0000")
+        robot.advance(1.5)
+        assert robot.body.left == 0
+        says(robot, "r0100", "Z0000", now=1.5)
+        robot.advance(1.6)
+        assert robot.body.left == 50, "it goes on where it was left, without being played anew"
+
     def test_an_empty_slot_plays_nothing(self) -> None:
         robot = old()
         assert says(robot, "r0005") == []
