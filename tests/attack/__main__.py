@@ -66,11 +66,13 @@ def _attack(name: str, seconds: int, *, keeping: bool) -> bool:
             (known / f"{number}").write_bytes(data)
         run = _fuzz(
             name, found, known, f"-max_total_time={seconds}", f"-max_len={LONGEST}", f"-timeout={STUCK_S}",
-            f"-rss_limit_mb={MEMORY_MIB}", f"-artifact_prefix={artifacts}/",
+            f"-report_slow_units={STUCK_S}", f"-rss_limit_mb={MEMORY_MIB}", f"-artifact_prefix={artifacts}/",
         )  # fmt: skip
         done, covered = _DONE.search(run.stderr), _COVERED.findall(run.stderr)
         if run.returncode or done is None:
             print(run.stdout, run.stderr, sep="\n")
+            if not any(artifacts.iterdir()):
+                print(f"{name}: no input did it; libFuzzer ended by itself or was ended, with {run.returncode}")
             for artifact in artifacts.iterdir():
                 data = artifact.read_bytes().hex()
                 print(f"{name}: {artifact.name.partition('-')[0]} by this input; tell it again with")

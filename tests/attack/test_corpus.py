@@ -82,6 +82,15 @@ def test_what_broke_a_target_is_printed_whole_with_what_tells_it_again(
     assert again.returncode == 0, again.stdout + again.stderr
 
 
+def test_a_fuzzer_that_was_ended_is_no_finding_of_an_input_but_a_failure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended = subprocess.CompletedProcess([], 72, "", "run interrupted\n")
+    monkeypatch.setattr(runner, "_fuzz", lambda *_: ended)
+    assert not runner._attack("trunk", 1, keeping=False)
+    assert "trunk: no input did it; libFuzzer ended by itself or was ended, with 72" in capsys.readouterr().out
+
+
 def test_an_input_told_again_fails_as_it_did(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[bytes] = []
     monkeypatch.setitem(TARGETS, "trunk", heard.append)
