@@ -165,7 +165,9 @@ class Broker:
     async def stop(self) -> None:
         """Refuse new calls, stop robots that are to be, let what waits go out, close the links, then the bus."""
         # At once: programs that do not read their replies must not hold up what stops robots.
-        await asyncio.gather(self._retire_bus(), self.resident.close())
+        for trouble in await asyncio.gather(self._retire_bus(), self.resident.close(), return_exceptions=True):
+            if isinstance(trouble, Exception):
+                log.error("stopping all the same", exc_info=trouble)
         try:
             async with asyncio.timeout(DRAIN_S):
                 await asyncio.gather(*(link.drained() for link in self.exchange.links.values()))

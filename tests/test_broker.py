@@ -407,6 +407,21 @@ async def test_programs_that_do_not_read_their_replies_do_not_hold_up_what_stops
         await lab.broker.stop()
 
 
+async def test_a_bus_that_cannot_take_leave_does_not_keep_the_links_from_being_closed(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = lab.broker._bus
+    assert bus is not None
+
+    async def fails() -> None:
+        raise RuntimeError("no leave taken")
+
+    monkeypatch.setattr(bus, "retire", fails)
+    await lab.broker.stop()
+    assert all(link.state != "open" for link in lab.broker.links())
+    assert "no leave taken" in caplog.text
+
+
 async def test_robots_of_programs_are_stopped_where_the_bus_is_lost_and_does_not_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,13 +82,21 @@ class Client:
         return {self.keys.read_broker(found)[0]: value for found, value in self.get_json(key, timeout_s).items()}
 
     def brokers(self, timeout_s: float = 3.0) -> list[Status]:
-        """The status of every broker on the bus, by name."""
+        """The status of every broker on the bus, by name.
+
+        Raises:
+            ValidationError: pydantic's: an answer is none that this version knows.
+        """
         key = self.keys.every_broker("status")
         found = [Status.model_validate_json(payload) for _, payload in self._get(key, timeout_s)]
         return sorted(found, key=lambda status: status.broker)
 
     def cards(self, timeout_s: float = 3.0) -> list[Card]:
-        """The robots that the brokers know, by name."""
+        """The robots that the brokers know, by name.
+
+        Raises:
+            ValidationError: as `brokers`.
+        """
         found = [Card.model_validate_json(payload) for _, payload in self._get(self.keys.every_card, timeout_s)]
         return sorted(found, key=lambda card: card.robot)
 
