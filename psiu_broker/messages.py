@@ -23,6 +23,10 @@ Kind = Literal[
 """What a frame is; event: something told unasked, as a sensor's value."""
 
 
+BROKER_NAME_MAX: Final = 255
+"""Letters in the name of a broker."""
+
+
 class Message(BaseModel):
     """What all messages share: unknown fields of a newer broker are ignored."""
 

@@ -68,7 +68,8 @@ class Resident:
         self._playing = Playing(configuration, exchange, self._calling, self.failsafe, clock)
         self._describe = describer(configuration)
         self._responder = Responder(configuration.broker.name)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], Address | None] = {}
+        """What goes on, and which robot it tells to stop in words."""
         self._naks = Rarely()
         self._asked: dict[str, _Asked] = {}
 
@@ -109,9 +110,9 @@ class Resident:
         if told is not None:
             self._exchange.send(told, now)
         elif not said(frame).answer:
-            name = _stop_of(route) if lane(frame) == STOP_LANE else None
-            waits = name is None or self._stops_of(route) < STOPS_KEPT
-            self._start(self._ask_for(frame, route, way, now, waits=waits), name)
+            stopped = route.robot if lane(frame) == STOP_LANE else None
+            waits = stopped is None or self._stops_of(stopped) < STOPS_KEPT
+            self._start(self._ask_for(frame, route, way, now, waits=waits), stopped)
         return LINK_DOWN if down else ANSWERED
 
     def malformed(self, malformed: Malformed, way: Way, now: float) -> None:
@@ -314,19 +315,14 @@ class Resident:
     def _has_room(self, frame: Frame, route: Route) -> bool:
         """Whether `frame` can be done for its sender; there is for a stop, unless others have yet to leave."""
         if lane(frame) == STOP_LANE:
-            return self._stops_of(route) < 2 * STOPS_KEPT
+            return self._stops_of(route.robot) < 2 * STOPS_KEPT
         return len(self._tasks) < TASKS_KEPT
 
-    def _stops_of(self, route: Route) -> int:
-        """How many stops in words its robot is being told."""
-        return sum(task.get_name() == _stop_of(route) for task in self._tasks)
+    def _stops_of(self, robot: Address) -> int:
+        """How many stops in words `robot` is being told."""
+        return sum(stopped == robot for stopped in self._tasks.values())
 
-    def _start(self, work: Coroutine[Any, Any, None], name: str | None = None) -> None:
-        task = asyncio.get_running_loop().create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-
-def _stop_of(route: Route) -> str:
-    """The name by which the stops of one robot are known among what goes on."""
-    return f"stop {route.robot}"
+    def _start(self, work: Coroutine[Any, Any, None], stopped: Address | None = None) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks[task] = stopped
+        task.add_done_callback(self._tasks.pop)

@@ -297,9 +297,8 @@ def check_bus(
     for trunk in trunks:
         device = getattr(trunk.adapter, "device", "")
         if not (_is_near(device) or protected or zenoh.unprotected):
-            text = f"whoever answers at {device}, or is on the way there, may move the robots"
-            how = "go by a tunnel that ends on 127.0.0.1, or say unprotected = true in [zenoh]"
-            problems.add(("trunks", trunk.name, "device"), f"{text}; {how}")
+            text = f"{_open_trunk(device)}, or say unprotected = true in [zenoh]"
+            problems.add(("trunks", trunk.name, "device"), text)
 
 
 def _check_roles(access: AccessConfiguration, problems: Problems) -> None:
@@ -348,8 +347,7 @@ def warnings_about(
             text = "whoever is at its far end counts as a broker, and shows no certificate"
             warnings.add(("trunks", trunk.name), f"{text}; see that nobody else reaches it")
         elif not _is_near(device := getattr(trunk.adapter, "device", "")):
-            text = f"whoever answers at {device}, or is on the way there, may move the robots"
-            warnings.add(("trunks", trunk.name, "device"), f"{text}; go by a tunnel that ends on 127.0.0.1")
+            warnings.add(("trunks", trunk.name, "device"), _open_trunk(device))
     for link in links:
         device = getattr(link.adapter, "device", None)
         if isinstance(device, str) and _NUMBERED_TTY.fullmatch(device):
@@ -358,6 +356,11 @@ def warnings_about(
                 f"{device} may be another device after the next plug-in; use its name under /dev/serial/by-id/",
             )
     return tuple(warnings.lines)
+
+
+def _open_trunk(device: str) -> str:
+    threat = f"whoever answers at {device}, or is on the way there, may move the robots"
+    return f"{threat}; go by a tunnel that ends on 127.0.0.1"
 
 
 def _is_near(device: str) -> bool:

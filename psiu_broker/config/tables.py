@@ -10,12 +10,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from psiu_broker.adapter import Adapter, Peer
 from psiu_broker.config.problems import got
 from psiu_broker.frame import EVERYONE, Address
+from psiu_broker.messages import BROKER_NAME_MAX
 from psiu_broker.profiles.persona import PersonaOptions
 from psiu_broker.profiles.profile import RobotOptions
 from psiu_broker.routing.outbox import is_question
-
-_LONGEST_BROKER_NAME: Final = 255
-"""Other brokers believe in no longer one."""
 
 
 def robot_name(name: str) -> str:
@@ -33,9 +31,9 @@ def _broker_name(name: str) -> str:
         raise ValueError(
             f"expected a name without spaces, got {got(name)}: a robot that has not met it misreads it; choose one word"
         )
-    if len(name) > _LONGEST_BROKER_NAME:
+    if len(name) > BROKER_NAME_MAX:
         raise ValueError(
-            f"expected a name of at most {_LONGEST_BROKER_NAME} letters, got {len(name)}; choose a shorter word"
+            f"expected a name of at most {BROKER_NAME_MAX} letters, got {len(name)}; choose a shorter word"
         )
     return robot_name(name)
 

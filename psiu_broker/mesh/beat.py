@@ -6,10 +6,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from psiu_broker.messages import BROKER_NAME_MAX
+
 Micros = Annotated[int, Field(ge=0, lt=2**63)]
 Epoch = Annotated[int, Field(ge=0, lt=2**64)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-Name = Annotated[str, Field(max_length=255)]
+Name = Annotated[str, Field(max_length=BROKER_NAME_MAX)]
 Counts = Annotated[dict[int, Count], Field(max_length=16)]
 """By lane."""
 
@@ -19,7 +21,7 @@ class Beat(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    broker: str = Field(min_length=1, max_length=255)
+    broker: str = Field(min_length=1, max_length=BROKER_NAME_MAX)
     epoch: int = Field(ge=0, lt=2**64, description="which life of the broker this is")
     zenoh_id: str = Field(default="", max_length=32)
     sent_us: Micros = Field(description="by the sender's clock")
@@ -44,7 +46,7 @@ class Notice(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    broker: str = Field(min_length=1, max_length=255)
+    broker: str = Field(min_length=1, max_length=BROKER_NAME_MAX)
     quality: int = Field(default=0, ge=0, le=10, description="of the link that heard it")
     frame: str | None = Field(default=None, max_length=200_000, description="the frame's envelope, in hexadecimal")
 
